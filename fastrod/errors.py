@@ -9,7 +9,7 @@ from enum import Enum
 
 
 class FastrodError(Exception):
-    """Base of every error that a user can cause and mend; the command line exits with 2 on it.
+    """Base of every error that a user can cause and correct; the command line exits with 2 on it.
 
     Its text is one line, whatever it quotes of a file or a library: what cannot be printed, line breaks and
     escapes too, is a space.

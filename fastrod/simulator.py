@@ -14,11 +14,10 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_ITERATIONS, ContactStep
-from fastrod.effects.pipeline import SensedPoses
+from fastrod.effects.executor import SensedPoses, from_base
 from fastrod.errors import InputError, Problem
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
-from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.contact_solver import RodSolver
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.inputs import (
@@ -381,7 +380,7 @@ class Simulator(Statics):
         center: ArrayLike,
         body: int | None = None,
     ) -> None:
-        """From the next step on this obstacle gives way to the rods: what it is told by `obstacle_pose` is
+        """From the next step on this obstacle gives way to the rods: what it is given by `obstacle_pose` is
         where it would be without them. `translation` [m/N] under a force at its `center` (3,) of mass,
         `rotation` (3, 3) [rad/(N m)] under a moment, both world and within one step: dt^2 / m and dt^2 I^-1
         for a body in free flight. Obstacles of one rigid body have the same number
@@ -450,14 +449,8 @@ class Simulator(Statics):
         the base frame, effects of sensing included. Effects before the rod show in the state itself. Raises
         `InputError` before the first step."""
         state, ports = self._last("measure")
-        pose = np.broadcast_to(ports.base_pose, (self.n_robots, 7))
-        rotation = matrix_from_quaternion(pose[:, 3:])
         points = np.zeros((self.n_robots, 0, 3))
         if self.outputs == "full" and self.robots[0].log_points:
-            points = self.shape(np.array(self.robots[0].log_points)).position - pose[:, None, :3]
-        seen = SensedPoses(
-            np.einsum("nji,nj->ni", rotation, state.tip_position - pose[:, :3]),
-            np.swapaxes(rotation, 1, 2) @ state.tip_rotation,
-            np.einsum("nji,nkj->nki", rotation, points),
-        )
+            points = self.shape(np.array(self.robots[0].log_points)).position - ports.base_pose[:, None, :3]
+        seen = from_base(ports.base_pose, state.tip_position, state.tip_rotation, points)
         return self._chain.sense(seen, ports, self._plain, self.dt, self._layout.n_steps)

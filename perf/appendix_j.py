@@ -1,5 +1,4 @@
-"""The rod of the paper's Appendix J, a passive cantilever under a dead force across its tip; what a peer that
-solves it is."""
+"""The rod of the paper's Appendix J, a passive cantilever under a dead tip force, and what a peer is."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ import numpy as np
 from cases import Array
 from fastrod import Robot, load_robot
 
-FORCES: Array = np.linspace(0.05, 0.7, 14)
-"""Load cases F_y [N]."""
+FORCES: Array = np.linspace(0.05, 0.7, 14)  # load cases F_y [N]
 Solve: TypeAlias = Callable[[Array], Array]
 """Tips at rest (n, 2) across and along the straight rod [m] under tip forces (n,) across it [N]."""
 Build: TypeAlias = Callable[[], AbstractContextManager[Solve]]
@@ -29,8 +27,7 @@ def robot() -> Robot:
     return replace(prototype, segments=(replace(prototype.segments[0], tendons=(), mode="passive"),))
 
 
-LENGTH = robot().length
-"""[m]"""
+LENGTH = robot().length  # m
 BENDING, TORSION = robot().segments[0].bending_stiffness[0], robot().segments[0].torsional_stiffness
 """EI of the round section, and GJ [N m^2]."""
 
@@ -38,11 +35,9 @@ BENDING, TORSION = robot().segments[0].bending_stiffness[0], robot().segments[0]
 def tips(force: Array) -> Array:
     """(n, 2) tip across and along the straight rod [m] under forces (n,) > 0 [N].
 
-    The elastica by elliptic integrals of parameter m = (1 + sin b)/2, b the tip's angle, sin^2 phi = 1/(2
-    m): sqrt(F l^2/EI) = K(m) - F(phi, m), and the tip follows from E. No step, no iteration but the
-    bisection of b.
-    Source: Bisshopp and Drucker, Large deflection of cantilever beams, Q. Appl. Math.
-    3(3), 1945.
+    The elastica by elliptic integrals of parameter m = (1 + sin b)/2, b the tip's angle, sin^2 phi = 1/(2 m):
+    sqrt(F l^2/EI) = K(m) - F(phi, m), and the tip follows from E. No step, no iteration but the bisection of
+    b. Source: Bisshopp and Drucker, Large deflection of cantilever beams, Q. Appl. Math. 3(3), 1945.
     """
     from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
@@ -69,26 +64,19 @@ class Rung:
     """One setting of a peer."""
 
     label: str
-    build: Build
-    """Solves the forces one after the other, each from the straight rod unless the peer says otherwise."""
-    together: Build | None = None
-    """Solves all forces in one call, where the peer has such a thing of its own."""
+    build: Build  # solves one force after the other, from the straight rod unless the peer says otherwise
+    together: Build | None = None  # solves all forces in one call, where the peer has such a thing of its own
 
 
 @dataclass(frozen=True, eq=False)
 class Peer:
     """One method to find the tip of the rod."""
 
-    name: str
-    """Begins with the family: peers of one family have one colour in the plot."""
-    modules: Sequence[str]
-    """What must be importable."""
-    same: str
-    """What was done so that it solves the same problem, and what could not be matched."""
-    also: str
-    """What it does that fastrod does not."""
-    rungs: Sequence[Rung]
-    """From coarse to fine."""
+    name: str  # begins with the family: peers of one family have one colour in the plot
+    modules: Sequence[str]  # what must be importable
+    same: str  # what was done so that it solves the same problem, and what could not be matched
+    also: str  # what it does that fastrod does not
+    rungs: Sequence[Rung]  # from coarse to fine
 
     @property
     def family(self) -> str:
@@ -97,9 +85,8 @@ class Peer:
     def missing(self) -> str | None:
         """A sentence where the peer cannot run here."""
         absent = [name for name in self.modules if importlib.util.find_spec(name) is None]
-        names = " and ".join(absent)
-        words = f"{self.name} is left out: {names} is not installed (pip install -e '.[peers]')."
-        return words if absent else None
+        words = f"is left out: {' and '.join(absent)} is not installed (pip install -e '.[peers]')."
+        return f"{self.name} {words}" if absent else None
 
     def versions(self) -> str:
         packages = ["pyelastica" if name == "elastica" else name for name in self.modules]

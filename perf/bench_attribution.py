@@ -1,18 +1,11 @@
-"""How often the missing effect is named: sealed logs of a plant that has no code of the model, opened after
-the verdict.
-
-fastrod bench attribution                      all cases, about half an hour on two cores python
-perf/bench_attribution.py --share 0.1   a tenth of them; --only single,none
-"""
+"""How often the missing effect is named: sealed logs of a plant that shares no code with the model."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
 import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -20,6 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+import fastrod
+from fastrod.identification.attribution import identify
+from fastrod.identification.excite import excitation
+from fastrod.logs.runlog import RunLog
 from report import Row, Section, bench, note_progress, table
 
 NOISE = 3e-4  # m
@@ -60,13 +59,7 @@ def cases(fraction: float, only: Iterable[str], first_seed: int = FIRST_SEED) ->
 
 def run(case: Case) -> dict[str, Any]:
     """Simulate, identify, and only then open the seal."""
-    import numpy as np
     import plant
-
-    import fastrod
-    from fastrod.identification.attribution import identify
-    from fastrod.identification.excite import excitation
-    from fastrod.logs.runlog import RunLog
 
     segments = 2 if case.kind == "segments" else 1
     robot = fastrod.load_robot("prototype") if segments == 1 else two_segments()
@@ -89,28 +82,16 @@ def run(case: Case) -> dict[str, Any]:
     exclude = list(seal.effects) if case.kind == "deleted" else []
     clock = time.perf_counter()
     result = identify(log, robot, exclude=exclude, free_camera=case.kind == "operator", threads=1)
-    return {
-        "case": case.kind,
-        "seed": case.seed,
-        "true": list(seal.effects),
-        "verdict": result.verdict,
-        "kind": result.remaining_kind,
-        "named": [e.name for e in result.effects],
-        "classes": [list(e.cannot_be_told_from) for e in result.effects],
-        "before": result.test.before,
-        "after": result.test.after,
-        "floor": result.noise.floor,
-        "bounds": len(result.bounds),
-        "left": result.remaining_share,
-        "seconds": time.perf_counter() - clock,
-        "rows": len(log),
-    }
+    row: dict[str, Any] = {"case": case.kind, "seed": case.seed, "true": list(seal.effects)}
+    row |= {"verdict": result.verdict, "kind": result.remaining_kind, "left": result.remaining_fraction}
+    row |= {"named": [e.name for e in result.effects], "bounds": len(result.bounds), "rows": len(log)}
+    row |= {"classes": [list(e.cannot_be_told_from) for e in result.effects], "floor": result.noise.floor}
+    row |= {"before": result.test.before, "after": result.test.after}
+    return row | {"seconds": time.perf_counter() - clock}
 
 
 def two_segments() -> Any:
     """The plant's longer robot: the prototype twice, the distal tendons at 45 degrees."""
-    import fastrod
-
     first = fastrod.load_robot("prototype").segments[0]
     rotated = tuple(replace(t, angle=float(t.angle) + math.pi / 4.0) for t in first.tendons)
     return fastrod.Robot(name="two_segments", segments=(first, replace(first, tendons=rotated)))
@@ -143,13 +124,12 @@ def score(kind: str, row: dict[str, Any]) -> bool:
     return first or (kind == "operator" and verdict != "explained")
 
 
+def median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One line a case."""
-    import numpy as np
-
-    def median(values: Iterable[float]) -> float | None:
-        return float(np.median(list(values))) if values else None
-
     made = []
     for kind, (_, wanted) in GOALS.items():
         own = [r for r in rows if r["case"] == kind]
@@ -157,9 +137,8 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         ratio = [r["after"] / r["floor"] for r in whole if r["named"]]
         line = {"case": kind, "logs": len(own), "goal": wanted, "crashed": len(own) - len(whole)}
         line["as_wanted"] = sum(score(kind, r) for r in own) / max(len(own), 1)
-        line["verdicts"] = ", ".join(
-            f"{n} {name}" for name, n in Counter(r["verdict"] for r in whole).items()
-        )
+        verdicts = Counter(r["verdict"] for r in whole)
+        line["verdicts"] = ", ".join(f"{n} {name}" for name, n in verdicts.items())
         line["after_over_floor_median"] = median(ratio)
         line["after_within_1.15"] = float(np.mean(np.array(ratio) <= 1.15)) if ratio else None
         line |= {f"{name}_mm_median": median([1e3 * r[name] for r in whole]) for name in ("before", "after")}
@@ -168,8 +147,7 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def confusion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """True effect -> what was named first (or the verdict where nothing was) -> logs, of the single, noise
-    and outside cases."""
+    """True effect -> what was named first, or the verdict -> logs; single, noise and outside cases."""
     counts: dict[str, Counter[str]] = {}
     for row in rows:
         if row["case"] in ("single", "outside", "none", "noise") and "error" not in row:
@@ -189,13 +167,10 @@ def sections(rows: list[dict[str, Any]], processes: int) -> list[Section]:
             )
             errors = {f"{name}_mm": 1e3 * row[name] for name in ("before", "after") if name in row}
             others.append({**head, "verdict": row.get("error") or row["verdict"], "named": names, **errors})
-    named = [
-        {
-            "true": true,
-            "named": ", ".join(f"{name} x {n}" for name, n in sorted(c.items(), key=lambda kv: -kv[1])),
-        }
-        for true, c in sorted(confusion(rows).items())
-    ]
+    named: list[Row] = []
+    for true, found in sorted(confusion(rows).items()):
+        first = sorted(found.items(), key=lambda pair: -pair[1])
+        named.append({"true": true, "named": ", ".join(f"{name} x {n}" for name, n in first)})
     return [
         table(
             "cases",
@@ -217,7 +192,7 @@ def sections(rows: list[dict[str, Any]], processes: int) -> list[Section]:
     ]
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     os.environ |= {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     fraction = 0.0 if options.quick else options.share
     todo = cases(fraction, options.only.split(",") if options.only else [], options.first_seed)
@@ -241,5 +216,3 @@ main = bench(
     ("--processes", os.cpu_count() or 1, "at a time"),
     ("--rows", Path, "write one JSON line a log there"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

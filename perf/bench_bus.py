@@ -1,16 +1,13 @@
 """The drives' bus in real time: what a set-point costs, how even the SYNCs are, whether a drive ever lacks
 one.
 
-Both ends on this machine: the controller's loop, four emulated drives, and the bus between them. Another
-process plays the drives where the bus is udp_multicast.
+Both ends on this machine; another process plays the drives where the bus is udp_multicast.
 """
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -50,8 +47,9 @@ def play_drives(bus: str, ends: Any) -> None:
 def elsewhere(bus: str) -> Iterator[list[int]]:
     """The drives in another process; the list has the set-points that they missed, once it has ended."""
     missed: list[int] = []
-    here, there = multiprocessing.get_context("spawn").Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=play_drives, args=(bus, there))
+    spawn = multiprocessing.get_context("spawn")
+    here, there = spawn.Pipe()
+    process = spawn.Process(target=play_drives, args=(bus, there))
     process.start()
     here.recv()
     try:
@@ -63,8 +61,7 @@ def elsewhere(bus: str) -> Iterator[list[int]]:
 
 
 def loop(bus_name: str, rate: float, seconds: float, note: str = "") -> Row:
-    """Connect, enable, sines for so long; `note`: with the collector of garbage, before other programs, or
-    stepped."""
+    """Connect, enable, sines for so long; `note`: collector on, first (before other programs), or stepped."""
     stepped, calm, note = note == "stepped", note != "collector on", f", {note}" if note else ""
     if note == ", first" and not urgent():
         note = ""
@@ -97,23 +94,15 @@ def loop(bus_name: str, rate: float, seconds: float, note: str = "") -> Row:
             raise RuntimeError(feedback.lost)
         if drives:
             missed.append(drives.missed_setpoints - before)
-    spread = [None if stepped else 1e6 * value for value in (jitter.p50, jitter.p99, jitter.max)]
-    return {
-        "bus": bus_name.split(":")[0] + note,
-        "rate": n / wall if stepped else rate,
-        "cycles": n,
-        "missed": sum(missed),
-        "unanswered": unanswered,
-        "late": pacer.slipped,
-        **dict(zip(("jitter_p50", "jitter_p99", "jitter_max"), spread, strict=True)),
-        "exchange_p50": 1e6 * exchange.median,
-        "exchange_p99": 1e6 * exchange.quantile(0.99),
-        "sdo": requests,
-        "cpu": cpu / wall,
-    }
+    row: Row = {"bus": bus_name.split(":")[0] + note, "rate": n / wall if stepped else rate, "cycles": n}
+    row |= {"missed": sum(missed), "unanswered": unanswered, "late": pacer.slipped, "sdo": requests}
+    for name in ("p50", "p99", "max"):
+        row[f"jitter_{name}"] = None if stepped else 1e6 * getattr(jitter, name)
+    row |= {"exchange_p50": 1e6 * exchange.median, "exchange_p99": 1e6 * exchange.quantile(0.99)}
+    return row | {"cpu": cpu / wall}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     seconds = 0.5 if options.quick else options.seconds
     short = min(seconds, 10.0)
     rows = []
@@ -133,9 +122,8 @@ def measure(options: argparse.Namespace) -> list[Section]:
             "[us]| jitter_max:.0f max [us] | exchange_p50:.0f exchange~p50 [us] | exchange_p99:.0f p99 [us]"
             "| sdo:d SDO in~the loop | cpu:.2f CPU~[cores]",
             rows,
-            "A set-point is missed where a drive, operation enabled, got a SYNC and no new target; a cycle "
-            "is not answered where a drive's process data did not come within 0.6 of it. 'stepped': no "
-            "waiting at all, the rate is what the machine computes. 'first': before other programs, where "
+            "A cycle is not answered where a drive's process data did not come within 0.6 of it. 'stepped': "
+            "no waiting at all, the rate is what the machine computes. 'first': before other programs, where "
             "the machine grants that; 'collector on': garbage is collected in the loop.",
             f"Both ends use one interpreter on 'virtual', and {os.cpu_count()} cores; with udp_multicast the "
             "drives are another process.",
@@ -144,5 +132,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--seconds", 60.0, "of the loop at 200 Hz"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from fastrod.model.routing import route
 from fastrod.rotation import product, quaternion_from_matrix, quaternion_from_vector
+from fastrod_device.camera import Camera, CameraFrame, Marker
+from fastrod_device.columns import FLAGS
+from fastrod_device.drawing import draw
+from fastrod_device.errors import RefusedError
+from fastrod_device.gates import ASTRAY, OUTSIDE, TOO_FAST
+from fastrod_device.hardware import load_hardware
+from fastrod_device.latency import estimate_latency
+from fastrod_device.tracker import MarkerTracker
+from fastrod_device.workbench import emulated
 from report import Measurement, Row, Section, bench, note_progress, table
 
 SIZE, FOCAL, PICTURE = 0.015, 800.0, (640, 480)
@@ -20,12 +28,9 @@ ERROR_TARGETS = {0.10: 0.2, 0.20: 0.9, 0.40: 3.0}
 """Root mean square error of the position [mm] by distance [m]."""
 LATENCY_TARGET, TIME_TARGET = 5.0, 4.0
 """[ms]."""
-TILTS = (0, 15, 30, 45, 60)
-"""[deg]."""
-FLIP = math.radians(5.0)
-"""From here on the wrong one of both solutions counts as a flip."""
-LOAD = 0.03
-"""On the tip while gates are tried [kg]."""
+TILTS = (0, 15, 30, 45, 60)  # [deg]
+FLIP = math.radians(5.0)  # from here on the wrong one of both solutions counts as a flip
+LOAD = 0.03  # on the tip while gates are tried [kg]
 KINDS = ("none", "backlash", "friction", "tendon_stretch", "creep", "gravity", "outside", "latency")
 
 
@@ -33,27 +38,15 @@ class Studio:
     """The emulator's camera with a lens that bends, a marker before it, and a tracker."""
 
     def __init__(self, seed: int) -> None:
-        from fastrod_device.camera import Camera, Marker
-        from fastrod_device.tracker import MarkerTracker
-
-        matrix, lens = (
-            ((FOCAL, 0.0, 319.5), (0.0, FOCAL, 239.5), (0.0, 0.0, 1.0)),
-            (-0.12, 0.05, 5e-4, -3e-4, 0.0),
-        )
-        self.camera, self.marker = (
-            Camera(matrix=matrix, size=PICTURE, distortion=lens),
-            Marker(size=SIZE, id=7),
-        )
-        self.rng, self.tracker = np.random.default_rng(seed), MarkerTracker(self.camera, self.marker)
+        matrix = (FOCAL, 0.0, 319.5), (0.0, FOCAL, 239.5), (0.0, 0.0, 1.0)
+        self.camera = Camera(matrix=matrix, size=PICTURE, distortion=(-0.12, 0.05, 5e-4, -3e-4, 0.0))
+        self.marker, self.rng = Marker(size=SIZE, id=7), np.random.default_rng(seed)
+        self.tracker = MarkerTracker(self.camera, self.marker)
 
     def draw(self, position: Any, quaternion: Any) -> Any:
-        from fastrod_device.drawing import draw
-
         return draw(self.camera, self.marker, position, quaternion, rng=self.rng)
 
     def look(self, image: Any, number: int, *expected: Any) -> Any:
-        from fastrod_device.camera import CameraFrame
-
         return self.tracker.look(CameraFrame(image=image, t=number / 15.0, number=number), *expected)
 
 
@@ -74,8 +67,7 @@ def rms(a: Any) -> float:
 
 
 def errors(n: int, distance: float, tilt: float | None) -> Row:
-    """Single frames at one distance; tilts up to 50 deg where none is given. The model expects the tip's
-    orientation within 3 deg."""
+    """Single frames; tilts up to 50 deg where none is given. The model expects the tip within 3 deg."""
     note_progress(f"{distance} m")
     studio, off = Studio(0), []
     rng = studio.rng
@@ -90,10 +82,9 @@ def errors(n: int, distance: float, tilt: float | None) -> Row:
         if seen.ok:
             off.append(1e6 * (seen.position - position))
     um = np.array(off)
+    head = {"distance": 100.0 * distance, "tilt": "0 to 50" if tilt is None else f"{tilt:g}", "frames": n}
     return {
-        "distance": 100.0 * distance,
-        "tilt": "0 to 50" if tilt is None else f"{tilt:g}",
-        "frames": n,
+        **head,
         "ok": 100.0 * len(off) / n,
         "rms": 1e-3 * rms(um),
         "target": ERROR_TARGETS[distance] if tilt is None else None,
@@ -104,8 +95,7 @@ def errors(n: int, distance: float, tilt: float | None) -> Row:
 
 
 def flips(n: int, distance: float, swing: float) -> Row:
-    """Smooth motion through the frontal pose: OpenCV's first solution from its own corners, and the
-    tracker without a model."""
+    """Smooth motion through the frontal pose: OpenCV's first solution, and the tracker without a model."""
     import cv2
 
     note_progress(f"flips at {distance} m")
@@ -113,7 +103,7 @@ def flips(n: int, distance: float, swing: float) -> Row:
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), options)
     corners = 0.5 * SIZE * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-    first, tracked = [], []
+    lens, first, tracked = (studio.camera.intrinsics, studio.camera.lens), [], []
     for k in range(n):
         t = k / 15.0
         tilt, azimuth = math.radians(swing) * math.sin(1.3 * t), 0.4 + 0.5 * math.sin(0.37 * t)
@@ -125,8 +115,8 @@ def flips(n: int, distance: float, swing: float) -> Row:
             tracked.append(flipped(sighting.quaternion, quaternion))
         found, _, _ = detector.detectMarkers(image)
         if len(found):
-            lens, flag = (studio.camera.intrinsics, studio.camera.lens), cv2.SOLVEPNP_IPPE_SQUARE
-            _, vectors, _, _ = cv2.solvePnPGeneric(corners, found[0].reshape(4, 2), *lens, flags=flag)
+            seen = found[0].reshape(4, 2)
+            _, vectors, _, _ = cv2.solvePnPGeneric(corners, seen, *lens, flags=cv2.SOLVEPNP_IPPE_SQUARE)
             rotation = np.asarray(cv2.Rodrigues(vectors[0])[0], dtype=np.float64)
             first.append(flipped(quaternion_from_matrix(rotation), quaternion))
     before, after = (100.0 * sum(some) / max(len(some), 1) for some in (first, tracked))
@@ -135,10 +125,7 @@ def flips(n: int, distance: float, swing: float) -> Row:
 
 
 def latency(seeds: int, rate: float, delay: float) -> Row:
-    """Four tendons that bend a 70 mm arc for 20 s, its tip seen late, with 0.3 mm of noise and one frame
-    in ten lost."""
-    from fastrod_device.latency import estimate_latency
-
+    """A 70 mm arc bends for 20 s; its tip is seen late, with 0.3 mm of noise, one frame in ten lost."""
     note_progress(f"latency {delay} s")
     t, seen = np.arange(0.0, 20.0, 0.01), np.arange(0.003, 20.0, 1.0 / rate)
     found = []
@@ -154,29 +141,15 @@ def latency(seeds: int, rate: float, delay: float) -> Row:
         tip += 3e-4 * rng.standard_normal((len(seen), 3))
         tip[rng.random(len(seen)) < 0.1] = np.nan
         found.append(estimate_latency(t, np.stack([x, y, -x, -y], axis=1), seen, tip))
-    ms = 1e3 * np.array([one.delay - delay for one in found])
-    return {
-        "rate": rate,
-        "delay": 1e3 * delay,
-        "seeds": seeds,
-        "mean": float(ms.mean()),
-        "rms": rms(ms),
-        "largest": float(np.abs(ms).max()),
-        "target": LATENCY_TARGET,
-        "stderr": 1e3 * float(np.mean([one.stderr for one in found])),
-    }
+    ms, stderr = 1e3 * np.array([(one.delay - delay, one.stderr) for one in found]).T
+    row: Row = {"rate": rate, "delay": 1e3 * delay, "seeds": seeds, "mean": float(ms.mean()), "rms": rms(ms)}
+    row |= {"largest": float(np.abs(ms).max()), "target": LATENCY_TARGET}
+    return row | {"stderr": float(stderr.mean())}
 
 
 def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
     """An honest marker against the gates: an emulator with a sealed effect, driven to random bends at the
     full rate, with a load for the second half."""
-    from fastrod.model.routing import route
-    from fastrod_device.columns import FLAGS
-    from fastrod_device.errors import RefusedError
-    from fastrod_device.gates import ASTRAY, OUTSIDE, TOO_FAST
-    from fastrod_device.hardware import load_hardware
-    from fastrod_device.workbench import emulated
-
     note_progress(f"gates, {kind}")
     hardware = load_hardware()
     routing, length = route(hardware.robot), hardware.robot.length
@@ -216,16 +189,9 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
                 for _ in range(10):
                     prototype.command(dl)
                     prototype.wait(0.1)
-    return {
-        "kind": kind,
-        "seeds": len(seeds),
-        "frames": sum(flags.values()),
-        "refused": sum(flags[flag] for flag in (OUTSIDE, ASTRAY, TOO_FAST)),
-        "off": 1e3 * max(off),
-        "fraction": max(off) / length,
-        "far": max(far) / length,
-        "high": 1e3 * min(high),
-    }
+    row: Row = {"kind": kind, "seeds": len(seeds), "frames": sum(flags.values())}
+    row |= {"refused": sum(flags[flag] for flag in (OUTSIDE, ASTRAY, TOO_FAST)), "off": 1e3 * max(off)}
+    return row | {"fraction": max(off) / length, "far": max(far) / length, "high": 1e3 * min(high)}
 
 
 def times(repeats: int, distance: float) -> Row:
@@ -240,15 +206,14 @@ def times(repeats: int, distance: float) -> Row:
     return {"distance": 100.0 * distance, **took, "target": TIME_TARGET, "draw": 1e3 * drawn.median}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     import cv2
 
     cv2.setNumThreads(1)
     n, many, seeds = (8, 15, 2) if options.quick else (200, 450, 20)
     tried = [(kind, range(1, 8 if kind == "latency" else 3), 16) for kind in KINDS]
-    tilts = [(distance, None) for distance in ERROR_TARGETS] + [
-        (d, tilt) for d in (0.10, 0.20) for tilt in TILTS
-    ]
+    tilts = [(distance, None) for distance in ERROR_TARGETS]
+    tilts += [(distance, tilt) for distance in (0.10, 0.20) for tilt in TILTS]
     return [
         table(
             "errors",
@@ -294,5 +259,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,18 +1,17 @@
-"""Control of a soft tip on an arm: one step with the analytic Jacobian, and with the paper's finite
-differences."""
+"""Control of a soft tip on an arm, by the analytic Jacobian and by the paper's finite differences."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from fastrod import Robot, Segment, Simulator, Tendon
+from fastrod.control import ResolvedRate, SoftTip, circle
 from report import Row, Section, bench, goal, note_progress, seconds, table
 
 RATE_TARGET, RATIO_TARGET = 1000.0, 20.0
@@ -70,13 +69,9 @@ class SerialArm:
 
 
 class Loop:
-    """A tip that follows a circle: six joints and two segments, four tendons each, six intervals a
-    segment."""
+    """A tip that follows a circle: six joints, two segments of four tendons, six intervals a segment."""
 
     def __init__(self) -> None:
-        from fastrod import Robot, Segment, Simulator, Tendon
-        from fastrod.control import ResolvedRate, SoftTip, circle
-
         tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
         stiffness: Any = {"bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001}
         segment = Segment(length=0.1, extension=(0.0, 0.03), line_density=0.1, tendons=tendons, **stiffness)
@@ -95,14 +90,14 @@ class Loop:
         target, velocity = self.path.position(self.t), self.path.velocity(self.t)
         began = time.perf_counter()
         self.tip.place(self.q)
-        placed = time.perf_counter()
+        at_place = time.perf_counter()
         J = jacobian()
         known = time.perf_counter()
         error = target - self.tip.position
         self.q = self.q + DT * self.control.rates(self.q, J, error, velocity, DT)
         done = time.perf_counter()
         self.t += DT
-        return placed - began, known - placed, done - known, float(np.linalg.norm(error))
+        return at_place - began, known - at_place, done - known, float(np.linalg.norm(error))
 
 
 def follow(loop: Loop, jacobian: Callable[[], Any], steps: int) -> Row:
@@ -116,7 +111,7 @@ def follow(loop: Loop, jacobian: Callable[[], Any], steps: int) -> Row:
     return {"rate": 1.0 / total, "total_us": 1e6 * total, **times, "error_m": error, "steps": steps}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """The same loop with the analytic Jacobian and with finite differences."""
     loop, twin = Loop(), Loop()
     note_progress("the analytic Jacobian")
@@ -135,8 +130,8 @@ def measure(options: argparse.Namespace) -> list[Section]:
             "| total_us:,.0f step~us | place_us:,.0f place~us | jacobian_us:,.0f Jacobian~us"
             "| rates_us:,.0f rates~us | error_m:.1e error [m]~median | steps:d",
             [{"kind": "analytic", **exact}, {"kind": "finite differences", **slow}],
-            "A tip on six joints and two segments (100 mm, four tendons, extension) follows a circle of 50 "
-            "mm in 20 s, 100 control steps a second of its time. Medians, warm.",
+            "Two segments of 100 mm, four tendons and extension; a circle of 50 mm in 20 s, 100 control "
+            "steps a second of its time. Medians, warm.",
             "Place: the arm's frame, tendon lengths of the action and one step of the rod. Differences: "
             "central, 24 settled tips, from the same snapshot.",
         )
@@ -144,5 +139,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,10 +1,7 @@
-"""A large batch on a GPU beside the CPU; without a GPU: what a pass reads, writes and computes, and one
-sentence."""
+"""A large batch on a GPU beside the CPU; without a GPU: what a pass reads, writes and computes."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from functools import partial
 from typing import Any
 
@@ -30,13 +27,9 @@ def case_of(key: str, n: int) -> Case:
     return next(case for case in cases.cases(n) if case.key == key)
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """Both tables; without a GPU the second alone."""
-    n_robots, absent = options.robots or (64 if options.quick else 1_000_000), ""
-    try:
-        checked("cuda")
-    except InputError as missing:
-        absent = str(missing)
+    n_robots, absent = options.robots or (64 if options.quick else 1_000_000), without_gpu()
     sizes = {"prototype": n_robots, "reacher": max(1, n_robots // 5)}
     points = {key: points_of(key, 16 if options.quick else 256) for key in sizes}
     tallies = flops.count(points, False)
@@ -44,11 +37,17 @@ def measure(options: argparse.Namespace) -> list[Section]:
     for key, n in sizes.items() if not absent else ():
         note_progress(f"{key}, {n} robots")
         times += time_rows(case_of(key, n), n, points[key])
-    work = [
-        work_row(key, n, points[key], sum(tallies[key].values(), flops.Tally()).flops)
-        for key, n in sizes.items()
-    ]
+    work = [work_row(key, n, points[key], tallies[key].flops) for key, n in sizes.items()]
     return ([time_section(times)] if times else []) + [work_section(work, absent)]
+
+
+def without_gpu() -> str:
+    """A sentence where there is none."""
+    try:
+        checked("cuda")
+    except InputError as missing:
+        return str(missing)
+    return ""
 
 
 def points_of(key: str, n: int) -> int:
@@ -58,41 +57,29 @@ def points_of(key: str, n: int) -> int:
     return cases.fewest_points(case, pose, *cases.fine_solution(case, pose))[0]
 
 
-class Timed:
-    """Best times of a simulator's steps, and of their parts."""
+def transferred(sim: Simulator) -> tuple[int, int]:
+    """Bytes sent and fetched until now."""
+    runner = sim._passes._runner
+    return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
-    def __init__(self, sim: Simulator, case: Case) -> None:
-        self.sim, steps = sim, Measurement()
-        for k in range(1, _STEPS + 1):
-            inputs, before = case.inputs(case.at(k, False)), self._moved()
-            self.state = steps.take(partial(sim.step, **inputs))
-            self.sent, self.fetched = (after - b for after, b in zip(self._moved(), before, strict=True))
-        self.step = min(steps.times[1:])
-        self._parts()
 
-    def _moved(self) -> tuple[int, int]:
-        runner = self.sim._passes._runner
-        return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
+def stages(sim: Simulator) -> dict[str, float]:
+    """Seconds of the pass alone, on ports that are there; its extra cost on new ones; bringing its shape
+    back."""
+    passes, ports, sending = sim._passes, sim._ports, Measurement()
+    assert ports is not None
+    shape = passes.new_shape("tip", False)
 
-    def _parts(self) -> None:
-        """The pass alone, on ports that are there already; then what it costs more on new ones, and to
-        bring its shape back."""
-        sim, passes = self.sim, self.sim._passes
-        ports = sim._ports
-        assert ports is not None
-        shape = passes.new_shape("tip", False)
+    def run(at: Ports) -> None:
+        passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
+        wait(sim.device)
 
-        def run(at: Ports) -> None:
-            passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
-            wait(sim.device)
-
-        run(ports)
-        self.kernel = best(partial(run, ports), _STEPS)
-        sending = Measurement()
-        for new in [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]:
-            sending.take(partial(run, new))
-        self.send = max(0.0, sending.least - self.kernel)
-        self.fetch = best(lambda: passes.collect(shape), _STEPS)
+    run(ports)
+    kernel = best(partial(run, ports), _STEPS)
+    for new in [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]:
+        sending.take(partial(run, new))
+    send, fetch = max(0.0, sending.least - kernel), best(lambda: passes.collect(shape), _STEPS)
+    return {"kernel": kernel, "send": send, "fetch": fetch}
 
 
 def wait(device: str) -> None:
@@ -114,18 +101,21 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
     for device, threads in [("cpu", t) for t in sorted({min(2, most), most})] + [("cuda", None)]:
         sim = Simulator(case.robot, n, threads=threads, device=device, **options)
         sim.restore(start)
-        timed = Timed(sim, case)
-        two = two or timed
-        ratio = two.kernel / timed.kernel
-        error = np.abs(timed.state.tip_position - two.state.tip_position)[two.state.ok]
-        rows.append(
-            {"robot": case.key, "robots": n, "points": points, "device": f"{device} {threads or ''}".strip()}
-            | {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
-            | {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
-            | {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
-            | (goal(ratio, _TARGET, least=True) if device == "cuda" else {})
-            | {"difference_m": float(error.max(initial=0.0)), "ok": float(timed.state.ok.mean())}
-        )
+        steps = Measurement()
+        for k in range(1, _STEPS + 1):
+            inputs, before = case.inputs(case.at(k, False)), transferred(sim)
+            state = steps.take(partial(sim.step, **inputs))
+            sent, fetched = (after - b for after, b in zip(transferred(sim), before, strict=True))
+        times = {"step": min(steps.times[1:]), **stages(sim)}
+        two = two or (times, state)
+        step_ratio, ratio = (two[0][stage] / times[stage] for stage in ("step", "kernel"))
+        error = np.abs(state.tip_position - two[1].tip_position)[two[1].ok]
+        row: Row = {"robot": case.key, "robots": n, "points": points, "ok": state.ok.mean()}
+        row |= {"device": f"{device} {threads or ''}".strip(), "difference_m": error.max(initial=0.0)}
+        row |= {f"{stage}_ms": 1e3 * took for stage, took in times.items()}
+        row |= {"sent_bytes": sent / n, "fetched_bytes": fetched / n}
+        row |= {"step_ratio": step_ratio, "kernel_ratio": ratio}
+        rows.append(row | (goal(ratio, _TARGET, least=True) if device == "cuda" else {}))
     return rows
 
 
@@ -161,13 +151,8 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     def each(arrays: Any) -> float:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray) and len(a) == n > 1) / n
 
-    moved = (
-        each(ports)
-        + each(passes.params)
-        + 2.0 * each(passes.peek())
-        + each(passes.new_shape("tip", False))
-        + 8.0
-    )
+    moved = each(ports) + each(passes.params) + 2.0 * each(passes.peek()) + 8.0
+    moved += each(passes.new_shape("tip", False))
     n_tendons, n_columns = len(passes.layout.tendon_segment), passes.n_columns(ports)
     scratch = scratch_size(n_tendons, passes.n_x, n_columns, passes.n_residuals(ports))
     bandwidth, peak, name = device_limits()
@@ -179,9 +164,7 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
 
 def device_limits() -> tuple[float, float, str]:
     """Bytes and double-precision operations a second: copied and computed here, or of an H100."""
-    try:
-        checked("cuda")
-    except InputError:
+    if without_gpu():
         return *_H100, "H100 SXM, data sheet"
     from numba import cuda
 
@@ -224,5 +207,3 @@ def work_section(rows: list[Row], absent: str) -> Section:
 main = bench(
     __doc__, measure, ("--robots", int, "prototypes; reachers are a fifth as many (1000000; 64 with --quick)")
 )
-if __name__ == "__main__":
-    sys.exit(main())

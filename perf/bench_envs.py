@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+import fastrod_envs
+from bench_lost import endure
+from fastrod.errors import HostError
+from fastrod_envs.registration import task_class
+from fastrod_envs.single import SingleEnv
+from fastrod_envs.vector import BatchEnv
 from report import Measurement, Row, Section, bench, best, note_progress, seconds, table, thread_counts
 
 SEED = 0
@@ -35,8 +39,7 @@ def step_seconds(env: Any, n: int, repeats: int) -> float:
 
 
 def simulator_fraction(env: Any, n: int) -> float:
-    """Fraction of a step's time that the simulator takes, its settling and putting back of robots
-    included."""
+    """Fraction of a step's time that the simulator takes, settling and putting back robots included."""
     simulator, spent, names = env.task.simulator, Measurement(), ("step", "settle", "restore", "replace")
 
     def timed(call: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,9 +69,6 @@ def reach_section(quick: bool) -> Section:
     """Reach in native batches, beside Gymnasium's SyncVectorEnv of its single environments."""
     from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-    from fastrod_envs.single import SingleEnv
-    from fastrod_envs.vector import BatchEnv
-
     repeats, mode = 1 if quick else 5, AutoresetMode.SAME_STEP
     sync: dict[int, float] = {}
     rows: list[Row] = []
@@ -84,10 +84,8 @@ def reach_section(quick: bool) -> Section:
             note_progress(f"{n} environments, {threads} threads")
             batch, steps = BatchEnv("Reach", n, threads=threads), steps_for(n, quick)
             took = step_seconds(batch, steps, repeats)
-            more = {
-                "ratio": sync.get(n, sync[most] * n / most) / took,
-                "fraction": simulator_fraction(batch, steps),
-            }
+            ratio = sync.get(n, sync[most] * n / most) / took
+            more = {"ratio": ratio, "fraction": simulator_fraction(batch, steps)}
             rows.append(row("native batch", n, threads, took) | more)
             batch.close()
     return table(
@@ -96,11 +94,8 @@ def reach_section(quick: bool) -> Section:
         "kind fastrod/Reach-v0 | n:,d N | threads:d | rate:,.0f env steps/s | step_us:,.2f us / env step"
         "| ratio:,.1f times as fast as~SyncVectorEnv | fraction:.0% simulator's fraction~of a step",
         rows,
-        "Random actions, drawn beforehand; episodes of 40 steps end and begin in between. Warm, best of "
-        "several runs. A step: action to tendon lengths, one observer pass, reward, observation, info, and "
-        "new episodes where one has ended.",
-        "SyncVectorEnv holds our own single environments, in this process; their simulators have one thread. "
-        f"Beyond N = {most} the ratio is to its time an environment at N = {most}.",
+        "Random actions; episodes of 40 steps. Warm, best of several runs. The simulators of SyncVectorEnv "
+        f"have one thread; beyond N = {most} the ratio is to its time an environment at N = {most}.",
         "For information, measured elsewhere: the paper's public reacher takes 240 to 390 env steps/s in one "
         "process, 686 on 64 workers.",
     )
@@ -108,11 +103,6 @@ def reach_section(quick: bool) -> Section:
 
 def task_section(quick: bool) -> Section:
     """Every other task, few steps: a batch where the rods are one simulator's, otherwise one environment."""
-    import fastrod_envs
-    from fastrod.errors import HostError
-    from fastrod_envs.registration import task_class
-    from fastrod_envs.vector import BatchEnv
-
     rows: list[Row] = []
     for name in fastrod_envs.names():
         if name == "Reach":
@@ -145,9 +135,6 @@ def task_section(quick: bool) -> Section:
 
 def endurance_section(total: int) -> Section:
     """About `total` random steps over all tasks: what they leave behind."""
-    import fastrod_envs
-    from bench_lost import endure
-
     rows = [row for name in fastrod_envs.names() if (row := endure(name, total))]
     return table(
         "endurance",
@@ -159,13 +146,12 @@ def endurance_section(total: int) -> Section:
     )
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     if options.endurance:
         return [endurance_section(0 if options.quick else options.endurance)]
     return [reach_section(options.quick), task_section(options.quick)]
 
 
-words = "only this: so many random steps over all tasks, 1000000 say"
-main = bench(__doc__, measure, ("--endurance", 0, words))
-if __name__ == "__main__":
-    sys.exit(main())
+main = bench(
+    __doc__, measure, ("--endurance", 0, "only this: so many random steps over all tasks, 1000000 say")
+)

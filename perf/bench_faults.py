@@ -1,25 +1,21 @@
-"""A prototype that runs, and faults put into one that moves.
+"""A prototype that runs, on drives that have an EPOS4's objects (or those of `--eds FILE`), and faults put
+into one that moves.
 
-First the whole procedure: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no
-others, home, and move for a minute at 200 Hz.
-
-The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and
-records. At a moment that a seed draws something fails. Detection is when the supervisor finds it (a killed
-process has none: there it is when the drives miss its heartbeat), standstill when the last shaft comes to
-rest, as the emulator knows it and no controller does.
+The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records.
+At a moment that a seed draws something fails. Detection is when the supervisor finds it (a killed process has
+none: there it is when the drives miss its heartbeat), standstill when the last shaft comes to rest, as the
+emulator knows it and no controller does.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import multiprocessing
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,13 +77,13 @@ class Rig:
         hardware = replace(hardware, limits=replace(hardware.limits, following_error=FOLLOWING))
         both: Any = {"clock": self.clock, "eds": eds}
         self.emulator = Emulator(hardware, bus, seal=seal(seed, "none"), seed=seed, taut=True, **both)
+        self.drives = self.emulator.drives
         self.journal = folder / f"{seed}-{time.monotonic_ns()}.journal.csv"
         self.log = self.journal.with_suffix(".log.csv")
         day = time.time() - self.clock.now()
         wall: Any = lambda: self.clock.now() + day + self.jump  # noqa: E731
-        self.prototype = Prototype(
-            hardware, bus, self.emulator, journal=Journal(self.journal), wall=wall, **both
-        )
+        both |= {"journal": Journal(self.journal), "wall": wall}
+        self.prototype = Prototype(hardware, bus, self.emulator, **both)
         self._other = BusLine(bus)
         self.prototype.start(home=False)
         self.recorder = record(self.prototype, self.log)
@@ -113,11 +109,6 @@ class Rig:
     def sync(self) -> None:
         self._other.send(0x080, b"")
 
-    def storm_on(self, syncs: int) -> None:
-        """From now on so many SYNCs of another node in every 10 ms."""
-        self.storm = syncs
-        self._repeat(1e-3 / syncs * max(STORMS), self.sync)
-
     def wait(self, seconds: float, until: Callable[[], bool]) -> None:
         """So much time passes, stopped or not, with commands, or less if `until` comes true."""
         end, due = self.clock.now() + seconds, -math.inf
@@ -136,24 +127,25 @@ class Rig:
     def stopped(self) -> bool:
         return self.prototype.supervisor.state is SafetyState.STOPPED
 
+    def block(self) -> None:
+        """The drive that pulls most: one that lets tendon out is found by its tension before, as the others
+        pull against it."""
+        readings = self.prototype.readings
+        self.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
+
+    def storm_on(self, syncs: int) -> None:
+        """From now on so many SYNCs of another node in every 10 ms."""
+        self.storm = syncs
+        self._repeat(1e-3 / syncs * max(STORMS), self.sync)
+
     def close(self) -> None:
         self._over.set()
         for thread in self._threads:
             thread.join(2.0)
-        self.emulator.drives.restore()
+        self.drives.restore()
         self.prototype.close()
         self._other.close()
         self.emulator.close()
-
-
-@contextmanager
-def rig(folder: Path, seed: int, **options: Any) -> Iterator[Rig]:
-    """One, closed at the end."""
-    made = Rig(folder, seed, **options)
-    try:
-        yield made
-    finally:
-        made.close()
 
 
 class Watch:
@@ -184,42 +176,17 @@ def circle(t: float) -> Floats:
     return np.concatenate([bend, -bend])
 
 
-def _block(rig: Rig, _: int) -> None:
-    """The drive that pulls most: one that lets tendon out is found by its tension before, as the others pull
-    against it."""
-    readings = rig.prototype.readings
-    rig.emulator.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
-
-
-def _jump(rig: Rig, k: int) -> None:
-    rig.jump += (3600.0, -0.5, 0.3)[k % 3]
-
-
-def _drives(call: Callable[[Any, int], Any]) -> Callable[[Rig, int], Any]:
-    return lambda rig, k: call(rig.emulator.drives, k)
-
-
-def _camera(flag: str) -> Callable[[Rig, int], Any]:
-    return lambda rig, _: setattr(rig.emulator, flag, True)
-
-
-_CODES, _COUNTS = (0x2310, 0x3210, 0x4310), (2000, -2000, 4000, -4000)
+_CODES, _COUNTS, _JUMPS = (0x2310, 0x3210, 0x4310), (2000, -2000, 4000, -4000), (3600.0, -0.5, 0.3)
 INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
-    "heartbeat lost": (_drives(lambda drives, k: drives.lose_heartbeat(k % 4)), "sent its last heartbeat"),
-    "emergency message": (
-        _drives(lambda drives, k: drives.emergency(k % 4, _CODES[k % 3])),
-        "sent an emergency: 0x",
-    ),
-    "following error": (_block, "ollowing error"),
-    "bus off": (_drives(lambda drives, _: drives.bus_off()), "the bus carries nothing"),
-    "node reboot": (_drives(lambda drives, k: drives.reboot(k % 4)), "NMT state is 0 (booting)"),
-    "camera frozen": (_camera("frozen"), "the camera repeats its frames"),
-    "marker lost": (_camera("hidden"), "the marker was last seen"),
-    "clock jump": (_jump, "the wall clock jumped"),
-    "encoder jump": (
-        _drives(lambda drives, k: drives.encoder_jump(k % 4, _COUNTS[k % 4])),
-        "moved its tendon by",
-    ),
+    "heartbeat lost": (lambda rig, k: rig.drives.lose_heartbeat(k % 4), "sent its last heartbeat"),
+    "emergency message": (lambda rig, k: rig.drives.emergency(k % 4, _CODES[k % 3]), "sent an emergency: 0x"),
+    "following error": (lambda rig, _: rig.block(), "ollowing error"),
+    "bus off": (lambda rig, _: rig.drives.bus_off(), "the bus carries nothing"),
+    "node reboot": (lambda rig, k: rig.drives.reboot(k % 4), "NMT state is 0 (booting)"),
+    "camera frozen": (lambda rig, _: setattr(rig.emulator, "frozen", True), "the camera repeats its frames"),
+    "marker lost": (lambda rig, _: setattr(rig.emulator, "hidden", True), "the marker was last seen"),
+    "clock jump": (lambda rig, k: setattr(rig, "jump", _JUMPS[k % 3]), "the wall clock jumped"),
+    "encoder jump": (lambda rig, k: rig.drives.encoder_jump(k % 4, _COUNTS[k % 4]), "moved its tendon by"),
     "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
 """How each is done to the k-th trial, and what its sentence must say."""
@@ -253,8 +220,8 @@ def run(seconds: float, *, stepped: bool, eds: Path | None) -> Row:
 def fail(kind: str, k: int, folder: Path, **options: Any) -> Trial:
     rng = np.random.default_rng([k, list(INJECTIONS).index(kind)])
     inject, words = INJECTIONS[kind]
-    with rig(folder, k, **options) as bench:
-        drives, journal = bench.emulator.drives, bench.prototype.journal
+    with closing(Rig(folder, k, **options)) as bench:
+        drives, journal = bench.drives, bench.prototype.journal
         bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), bench.stopped)
         injected = bench.clock.now()
         inject(bench, k)
@@ -313,11 +280,8 @@ def be_killed(log: Path, ends: Any) -> None:
 
 def kill(k: int, folder: Path) -> Trial:
     """One trial with the controller in a process of its own."""
-    rng, log, spawn = (
-        np.random.default_rng([k, 99]),
-        folder / "killed.csv",
-        multiprocessing.get_context("spawn"),
-    )
+    rng, log = np.random.default_rng([k, 99]), folder / "killed.csv"
+    spawn = multiprocessing.get_context("spawn")
     emulator = Emulator(load_hardware(), UDP, clock=WallClock(), seal=seal(k, "none"), seed=k, taut=True)
     here, there = spawn.Pipe(duplex=False)
     child, drives = spawn.Process(target=be_killed, args=(log, there)), emulator.drives
@@ -350,10 +314,8 @@ def kill(k: int, folder: Path) -> Trial:
         sentence = missed if named else "a drive did not miss it"
         if not moved:
             sentence = f"nothing moved before it was killed; it was {state}"
-        times, again = (
-            (found - injected, max(at - found, 0.0), at - injected),
-            watch.again or bool(watch.on.any()),
-        )
+        times = found - injected, max(at - found, 0.0), at - injected
+        again = watch.again or bool(watch.on.any())
         return Trial(*times, named, rows, max(rows - kept, 0), 0, again, sentence)
     finally:
         child.kill()
@@ -363,15 +325,14 @@ def kill(k: int, folder: Path) -> Trial:
 
 def _row(kind: str, trials: Sequence[Trial]) -> Row:
     worst = {name: 1e3 * max(getattr(t, name) for t in trials) for name in ("found", "rest", "whole")}
-    sums = {
-        name: sum(getattr(t, name) for t in trials) for name in ("named", "rows", "lost", "lines", "again")
-    }
+    counts = ("named", "rows", "lost", "lines", "again")
+    sums = {name: sum(getattr(t, name) for t in trials) for name in counts}
     sentence = next((t.sentence for t in trials if not t.named), trials[0].sentence)
     safe = sum(trial.rest <= SAFE for trial in trials)
     return {"kind": kind, "n": len(trials), "safe": safe, **worst, **sums, "sentence": sentence}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     times, found = 1 if options.quick else options.times, []
     urgent()  # before other programs, where that is granted
     how, time_is = {"stepped": options.stepped, "eds": options.eds}, ", stepped" if options.stepped else ""
@@ -423,5 +384,3 @@ main = bench(
     ("--eds", Path, "of the drives (default: an EPOS4's)"),
     ("--stepped", False, "as fast as the machine computes, not in real time"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

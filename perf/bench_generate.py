@@ -1,16 +1,8 @@
-"""Data sets: one worker, two, Ray tasks, start and dispatch; and from these the rate of N machines.
-
-fastrod bench generate                     a million loaded five-segment shapes among them: some minutes on
-two quiet cores python perf/bench_generate.py --cores 64   machines of so many cores in the table of N
-machines
-"""
+"""Data sets: one worker, two, Ray tasks, start and dispatch; and from these the rate of N machines."""
 
 from __future__ import annotations
 
-import argparse
 import math
-import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,16 +38,11 @@ TARGET = 60.0  # s for a million shapes on two cores
 class Costs(NamedTuple):
     """What the table of N machines is computed from, all measured here."""
 
-    task: float
-    """Of one worker for one shard, written [s]."""
-    start: float
-    """Until the first worker begins, the cluster being there [s]."""
-    dispatch: float
-    """Of the driver for one task [s]."""
-    check: float
-    """Of the driver at the end, a row [s]."""
-    bytes: float
-    """Of a row on the disk."""
+    task: float  # of one worker for one shard, written [s]
+    start: float  # until the first worker begins, the cluster being there [s]
+    dispatch: float  # of the driver for one task [s]
+    check: float  # of the driver at the end, a row [s]
+    bytes: float  # of a row on the disk
 
 
 def loaded(**options: Any) -> Shapes:
@@ -64,7 +52,7 @@ def loaded(**options: Any) -> Shapes:
     return Shapes(robot=dumps(replace(robot, segments=segments)), **options)
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     quick, ray = options.quick, find_spec("ray") is not None
     rows = 512 if quick else Plan(work=loaded(), count=1).shard_rows
     with tempfile.TemporaryDirectory(prefix="fastrod-bench-") as folder:
@@ -131,11 +119,9 @@ def solved(lanes: int, threads: int) -> None:
 def whole_runs(place: Path, rows: int, shards: int, *, ray: bool) -> Section:
     """The same plan on processes and on Ray, from the call to the checked end."""
     plan = Plan(work=loaded(), count=rows * shards, shard_rows=rows)
-    kinds: list[tuple[str, int, str | None]] = [("processes here", n, None) for n in (1, 2)]
-    kinds += [("Ray, local cluster", n, "local") for n in (1, 2)] if ray else []
-    made: list[Row] = []
-    alone = math.nan
-    for number, (what, workers, address) in enumerate(kinds):
+    kinds = [("processes here", None), ("Ray, local cluster", "local")][: 2 if ray else 1]
+    made, alone = list[Row](), math.nan
+    for number, ((what, address), workers) in enumerate(product(kinds, (1, 2))):
         ticks: list[tuple[float, int]] = []
         begin = time.perf_counter()
 
@@ -161,8 +147,7 @@ def whole_runs(place: Path, rows: int, shards: int, *, ray: bool) -> Section:
 
 
 def nothing(number: int) -> tuple[int, int, int, int]:
-    """A task of no work that returns as much as a real one."""
-    return number, 0, 0, 0
+    return number, 0, 0, 0  # as much as a real task returns
 
 
 @contextmanager
@@ -177,7 +162,7 @@ def _ray() -> Iterator[Any]:
     import ray
 
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="error")
-    remote = ray.remote(num_cpus=1)(lambda number: (number, 0, 0, 0))
+    remote = ray.remote(num_cpus=1)(lambda number: (number, 0, 0, 0))  # no name that a worker would import
 
     def run(tasks: int) -> None:
         pending, number = list[Any](), 0
@@ -203,13 +188,11 @@ def dispatch_costs(tasks: int, *, ray: bool) -> tuple[float, float, Section]:
             cluster = time.perf_counter() - begin
             first, _ = seconds(partial(run, 1))
             each = seconds(partial(run, tasks))[0] / tasks
-        started = cluster + first if what == "process pool" else first
-        name = what if what == "process pool" else "Ray, first worker on a cluster that is there"
-        made.append({"what": name, "start": started, "dispatch": 1e3 * each})
+        starts = {f"{what}{', with a local cluster' * (what == 'Ray')}": cluster + first}
         if what == "Ray":
-            made.append(
-                {"what": "Ray, with a local cluster", "start": cluster + first, "dispatch": 1e3 * each}
-            )
+            starts = {"Ray, first worker on a cluster that is there": first, **starts}
+        made += [{"what": name, "start": start, "dispatch": 1e3 * each} for name, start in starts.items()]
+        started = next(iter(starts.values()))
     text = "what driver | start:.2f s to the first~result | dispatch:.3f ms a task"
     return each, started, table("dispatch", f"Start and dispatch, {tasks} tasks of no work", text, made)
 
@@ -218,10 +201,10 @@ def check_cost(folder: Path) -> float:
     """Seconds a row of finding the shards and counting their rows."""
     plan = read_plan(folder)
     assert plan is not None
-    took = [
-        seconds(lambda: (found(plan, folder / SHARDS), counted(plan, folder / SHARDS)))[0] for _ in range(3)
-    ]
-    return statistics.median(took) / plan.count
+    shards, took = folder / SHARDS, Measurement()
+    for _ in range(3):
+        took.take(lambda: (found(plan, shards), counted(plan, shards)))
+    return took.median / plan.count
 
 
 def machines(costs: Costs, rows: int, per_machine: int) -> Section:
@@ -236,10 +219,9 @@ def machines(costs: Costs, rows: int, per_machine: int) -> Section:
             alone = took if n == MACHINES[0] else alone
             row: Row = {"count": f"{count:,}", "machines": n, "cores": n * per_machine, "tasks": tasks}
             row |= {"seconds": took, "rate": count / took, "efficiency": alone / took / n}
-            most = max(
-                ("work", working), ("dispatch", handing), ("check", checking), key=lambda pair: pair[1]
-            )
-            made.append(row | {"written": 1e-6 * costs.bytes * count / took, "bound": most[0]})
+            bounds = {"work": working, "dispatch": handing, "check": checking}
+            row |= {"written": 1e-6 * costs.bytes * count / took}
+            made.append(row | {"bound": max(bounds, key=bounds.__getitem__)})
     return table(
         "machines",
         f"N machines of {per_machine} cores, computed",
@@ -258,9 +240,8 @@ def machines(costs: Costs, rows: int, per_machine: int) -> Section:
 
 
 def million(folder: Path) -> Section:
-    """The acceptance: a million loaded five-segment shapes on two cores."""
     summary = generate(Plan(work=loaded(), count=10**6), folder, workers=2)
-    row = {"rows": summary.rows, "failed": summary.failed, "seconds": summary.seconds, "rate": summary.rate}
+    row: Row = {name: getattr(summary, name) for name in ("rows", "failed", "seconds", "rate")}
     return table(
         "million",
         "A million loaded five-segment shapes, two workers",
@@ -273,5 +254,3 @@ def million(folder: Path) -> Section:
 
 
 main = bench(__doc__, measure, ("--cores", 16, "of a machine, in the table of N machines"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+import fastrod
+from fastrod.hosts import BulletLink, MountedRod, SoftManiSim, connect
 from report import Measurement, Row, Section, bench, note_progress, table
 
 DT = 0.005
-SIZE = 0.06
-"""Edge of the cube [m]."""
+SIZE = 0.06  # edge of the cube [m]
 
 
-def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, touch: bool) -> tuple[Any, int]:
-    """A rod along x on a fixed body, and a cube at `place`, which it feels if `touch`."""
-    import fastrod
-    from fastrod.hosts import BulletLink, MountedRod, connect
-
+def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, felt: bool) -> tuple[Any, int]:
+    """A rod along x on a fixed body, and a cube at `place`, which it feels if `felt`."""
     world = connect(dt=DT, gravity=(0.0, 0.0, -gravity))
     post = world.createMultiBody(0.0, -1, -1, [0.0, 0.0, 0.0])
     shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3)
     cube = world.createMultiBody(mass, shape, -1, list(place))
     world.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     along_x = BulletLink(world, post, quaternion=(0.5**0.5, 0.0, 0.5**0.5, 0.0))
-    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if touch else []), cube
+    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if felt else []), cube
 
 
 def timed(
     what: str, step: Callable[[int], Any], steps: int, contact: Callable[[], bool] = lambda: False
 ) -> Row:
-    """Milliseconds of a step: median, 95th percentile and the longest, and how many were in contact or
-    failed."""
     note_progress(what)
     for k in range(3):
         step(k)
@@ -53,10 +47,10 @@ def rods(steps: int) -> list[Row]:
     """Mounted rods, free and in contact."""
     rows = []
     for robot in ("prototype", "five_segment_reacher"):
-        rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, touch=False)
+        rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, felt=False)
         swing = lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k)))  # noqa: E731
         rows.append(timed(f"{robot}, free", swing, steps))
-    rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, touch=True)
+    rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, felt=True)
     rest, world = rod.simulator.robots[0].rest_tendon_length, rod.bullet
 
     def push(k: int) -> Any:
@@ -64,30 +58,29 @@ def rods(steps: int) -> list[Row]:
         world.resetBaseVelocity(rod.host.body, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
         return rod.step(tendon_length=rest)
 
-    def felt(rod: Any) -> bool:
+    def in_contact(rod: Any) -> bool:
         return bool(rod.state.contacts.count[0])
 
-    rows.append(timed("prototype, pushes a free cube", push, steps, partial(felt, rod)))
-    long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, touch=True)
+    rows.append(timed("prototype, pushes a free cube", push, steps, partial(in_contact, rod)))
+    long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, felt=True)
     what = "five_segment_reacher, 20 g fall on it"
-    return [*rows, timed(what, lambda _: long.step(), steps, partial(felt, long))]
+    return [*rows, timed(what, lambda _: long.step(), steps, partial(in_contact, long))]
 
 
 def paper(steps: int) -> list[Row]:
-    from fastrod.hosts import SoftManiSim
-
     soft = SoftManiSim()
     soft.add_a_cube([0.1, 0.1, 0.03], size=[0.06] * 3)
-    wave = np.array([0.0, 0.002, 0.001] * 3)
-    calls: dict[str, tuple[Callable[[int], Any], int]] = {
-        "SoftManiSim, 3 segments: move_robot_ori": (
-            lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)),
-            steps,
-        ),
-        "calc_tip_pos": (lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)), steps),
-        "capture_image, 640 x 480": (lambda _: soft.capture_image(), max(3, steps // 20)),
-    }
-    rows = [timed(what, lambda k, call=call: call(k) and None, n) for what, (call, n) in calls.items()]
+    most = np.array([0.0, 0.002, 0.001] * 3)
+
+    def wave(k: int) -> Any:
+        return most * np.sin(0.02 * k)
+
+    calls: list[tuple[str, Callable[[int], Any], int]] = [
+        ("SoftManiSim, 3 segments: move_robot_ori", lambda k: soft.move_robot_ori(wave(k)), steps),
+        ("calc_tip_pos", lambda k: soft.calc_tip_pos(wave(k)), steps),
+        ("capture_image, 640 x 480", lambda _: soft.capture_image(), max(3, steps // 20)),
+    ]
+    rows = [timed(what, lambda k, call=call: call(k) and None, n) for what, call, n in calls]
     soft.close()
     return rows
 
@@ -108,7 +101,7 @@ def engines(steps: int) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     steps = 10 if options.quick else 200
     return [
         table(
@@ -118,7 +111,7 @@ def measure(options: argparse.Namespace) -> list[Section]:
             "| in_contact:.2f in contact | failed:d not ok | steps:d",
             rods(steps) + paper(steps),
             f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world "
-            "is in it. Warm. The longest step is that in which a rod loses its hold.",
+            "is in it. Warm.",
         ),
         table(
             "engines",
@@ -134,5 +127,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

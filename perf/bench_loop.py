@@ -1,13 +1,7 @@
-"""The whole loop on sealed emulators.
-
-Each seed seals another effect of another size into an emulator; the loop excites it, identifies it, plans
-anew and tracks. The seal is opened when the verdict is in.
-"""
+"""The whole loop on sealed emulators: excite, identify, plan anew, track, and open the seal."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -25,10 +19,8 @@ NOMINAL = {"bending_stiffness": 2.2e-3, "torsional_stiffness": 1.0e-3}
 
 
 def _one(seed: int, effect: str | None, *, load: bool) -> Row:
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        emulated(load_hardware(), seed=seed, effect=effect) as bench,
-    ):
+    workbench = emulated(load_hardware(), seed=seed, effect=effect)
+    with tempfile.TemporaryDirectory() as folder, workbench as bench:
         payload = None if load else 0.0
         loop = close_loop(bench.prototype, bench.assistant, Path(folder), payload=payload, turn=load)
         assert bench.emulator is not None
@@ -40,26 +32,16 @@ def _one(seed: int, effect: str | None, *, load: bool) -> Row:
         estimates[name].value * nominal / true if name in estimates else None
         for (name, nominal), true in zip(NOMINAL.items(), stiffness, strict=True)
     ]
-    before, after = (
-        1e3 * float(np.sqrt(np.mean([one.distance**2 for one in runs]))) for runs in (loop.before, loop.after)
-    )
+    tracked = {"track_before": loop.before, "track_after": loop.after}
     noise, test = result.noise.floor, result.test
-    return {
-        "seed": seed,
-        "sealed": ", ".join(sealed) or "none",
-        "verdict": result.verdict,
-        "found": ", ".join(name + (f" ({', '.join(c)})" if c else "") for name, c in classes.items()),
-        "right": _right(result.verdict, classes, sealed),
-        "floor": 1e3 * noise,
-        "before": 1e3 * test.before,
-        "after": 1e3 * test.after,
-        "over": test.after / noise,
-        "track_before": before,
-        "track_after": after,
-        "axis": 1e3 * max(float(np.max(one.rms - one.floor_rms)) for one in loop.after),
-        "E": ratio[0],
-        "G": ratio[1],
-    }
+    row: Row = {"seed": seed, "sealed": ", ".join(sealed) or "none", "verdict": result.verdict}
+    row["found"] = ", ".join(name + (f" ({', '.join(c)})" if c else "") for name, c in classes.items())
+    row |= {"right": _right(result.verdict, classes, sealed), "over": test.after / noise}
+    row |= {"floor": 1e3 * noise, "before": 1e3 * test.before, "after": 1e3 * test.after}
+    for name, runs in tracked.items():
+        row[name] = 1e3 * float(np.sqrt(np.mean([one.distance**2 for one in runs])))
+    row["axis"] = 1e3 * max(float(np.max(one.rms - one.floor_rms)) for one in loop.after)
+    return row | {"E": ratio[0], "G": ratio[1]}
 
 
 def _right(verdict: str, classes: dict[str, list[str]], sealed: list[str]) -> bool:
@@ -73,7 +55,7 @@ def _right(verdict: str, classes: dict[str, list[str]], sealed: list[str]) -> bo
     return first is not None and sealed[0] in (first[0], *first[1])
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     rows: list[Any] = []
     for seed in range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds)):
         rows.append(_one(seed, options.effect, load=not options.no_load))
@@ -108,5 +90,3 @@ main = bench(
     ("--effect", str, "seal this one in all of them; none and outside too"),
     ("--no-load", False, "nothing known hangs on the tip, and the base stays upright"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import resource
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -20,9 +19,9 @@ from fastrod_envs.registration import task_class
 from fastrod_envs.vector import BatchEnv
 from report import Row, Section, bench, note_progress, table
 
+# kg/m of weight that half of the steps draw on top: at the upper end most passes of the reacher diverge at
+# first
 HEAVY = {"gravity.line_density": (0.02, 0.1)}
-"""Weight [kg/m] that half of the steps draw on top: at the upper end most passes of the reacher diverge at
-first."""
 _TOLERANCE = 1e-9
 
 
@@ -30,23 +29,14 @@ _TOLERANCE = 1e-9
 class Count:
     """What happened to the robots of one task."""
 
-    steps: int = 0
-    """Of environments."""
-    robots: int = 0
-    """Robot-steps of all simulators."""
-    settled: int = 0
-    """Robot-steps without contact that took more than a step's passes: the pass diverged and `step`
-    settled."""
-    lost: int = 0
-    """Robot-steps that were not ok, though their input could be used."""
-    solvable: int = 0
-    """Of those, which a new simulator settles on the same inputs."""
-    in_contact: int = 0
-    """Of the lost, those of a simulator whose rods feel contact."""
-    solvable_in_contact: int = 0
-    """Of those, which a new simulator settles: cold, so it may find a rod on the other side of a wall."""
-    ended: int = 0
-    """Episodes that ended as lost."""
+    steps: int = 0  # of environments
+    robots: int = 0  # robot-steps of all simulators
+    settled: int = 0  # robot-steps without contact of more than a step's passes: it diverged, `step` settled
+    lost: int = 0  # robot-steps that were not ok, though their input could be used
+    solvable: int = 0  # of those, which a new simulator settles on the same inputs
+    in_contact: int = 0  # of the lost, those of a simulator whose rods feel contact
+    solvable_in_contact: int = 0  # of those, which a new simulator settles: cold, maybe beyond a wall
+    ended: int = 0  # episodes that ended as lost
 
 
 @contextmanager
@@ -74,15 +64,15 @@ def watched(count: Count) -> Iterator[None]:
             count.solvable_in_contact += solved and feels
         return state
 
-    Simulator.step, Simulator._read = stepping, reading  # type: ignore[method-assign,assignment]
-    try:
+    with patch.object(Simulator, "step", stepping), patch.object(Simulator, "_read", reading):
         yield
-    finally:
-        Simulator.step, Simulator._read = step, read  # type: ignore[method-assign]
 
 
-def _robot(simulator: Simulator, i: int) -> Any:
-    return simulator.robots[i if len(simulator.robots) > 1 else 0]
+def _anew(simulator: Simulator, i: int, **changes: Any) -> Simulator:
+    """Another simulator of robot i alone: as it is, or changed and without contact."""
+    robot = replace(simulator.robots[i if len(simulator.robots) > 1 else 0], **changes)
+    scene, points = None if changes else simulator.contact, simulator._layout.n_steps
+    return Simulator(robot, points_per_segment=points, threads=1, contact=scene)
 
 
 def _row(arrays: Any, i: int, n: int) -> Any:
@@ -92,15 +82,13 @@ def _row(arrays: Any, i: int, n: int) -> Any:
 
 def _settled(simulator: Simulator, i: int, ports: Ports) -> bool:
     """Whether a new simulator settles on what the kernel was given for robot i, effects included."""
-    plain = replace(_robot(simulator, i), effects=())
-    fresh = Simulator(plain, points_per_segment=simulator._layout.n_steps, threads=1)
+    fresh = _anew(simulator, i, effects=())
     params = _row(simulator._passes.params, i, simulator.n_robots)
     return bool(fresh.settle_ports(_row(ports, i, simulator.n_robots), params, _TOLERANCE).ok[0])
 
 
 def _settled_in_contact(simulator: Simulator, i: int, named: dict[str, Any]) -> bool:
-    points, scene = simulator._layout.n_steps, simulator.contact
-    fresh = Simulator(_robot(simulator, i), points_per_segment=points, threads=1, contact=scene)
+    fresh = _anew(simulator, i)
 
     def one(value: Any) -> Any:
         if isinstance(value, dict):
@@ -159,11 +147,10 @@ def endure(task: str, total: int) -> Row | None:
     return {"task": task, "steps": n * steps, **found}
 
 
-_FRACTION = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}
-"""Of all steps of `endure`."""
+_FRACTION = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}  # of all steps of `endure`
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     tasks = options.tasks or fastrod_envs.names()
     each = 4 if options.quick else -(-options.steps // (2 * len(tasks)))
     rows: list[Row] = []
@@ -195,5 +182,3 @@ main = bench(
     ("--tasks", (str,), "these alone"),
     ("--seed", 0, "of all"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

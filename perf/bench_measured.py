@@ -1,11 +1,7 @@
-"""The closed loop on measured robots: error before and after, on data that no fit has seen.
-
-fastrod bench measured             reads ../shared/data beside the checkout, or the folder in FASTROD_DATA
-"""
+"""The closed loop on measured robots: error before and after, on data that no fit has seen."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Callable
@@ -21,34 +17,28 @@ from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
-from fastrod.model.robot import Robot
+from fastrod.model.robot import Robot, Segment
 from report import ROOT, SHARED, Row, Section, bench, note_progress, table
 
 sys.path.append(str(ROOT / "scenes"))
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, ethz_beam
 
 DATA = Path(os.environ.get("FASTROD_DATA", SHARED / "data"))
-Found = tuple[Row, list[str]]
-"""A row, and its notes."""
+Found = tuple[Row, list[str]]  # a row, and its notes
 
 
 def row(name: str, result: Result) -> Found:
     """One log's errors; its notes tell the path of the search and what was identified."""
     steps = (f"{s.name} {1e3 * s.train:.2f} / {1e3 * s.held_out:.2f}" for s in result.path)
     made: Row = {"log": name, "held_out": ", ".join(result.held_out), "rows": int(result.measured.sum())}
-    errors = {
-        "train_before": result.train.before,
-        "train_after": result.train.after,
-        "floor": result.noise.floor,
-    }
-    errors |= {"before": result.test.before, "after": result.test.after}
+    errors = {"before": result.test.before, "after": result.test.after, "floor": result.noise.floor}
+    errors |= {"train_before": result.train.before, "train_after": result.train.after}
     made |= {f"{key}_mm": 1e3 * value for key, value in errors.items()}
     notes = [f"{name}: {result.summary}", f"  fitted / held out [mm]: {', '.join(steps)}"]
     for e in result.effects:
         values = ", ".join(f"{k} {v.value:.3g} {v.unit}" for k, v in e.parameters.items())
-        notes.append(
-            f"  {e.name}: {values}; cannot be told from {', '.join(e.cannot_be_told_from) or 'nothing'}"
-        )
+        others = ", ".join(e.cannot_be_told_from) or "nothing"
+        notes.append(f"  {e.name}: {values}; cannot be distinguished from {others}")
     return made | {"verdict": result.verdict, "remaining": result.remaining_kind}, notes
 
 
@@ -58,35 +48,28 @@ def trunk() -> list[Found]:
     log, robot = asl_trunk(DATA / "asl_trunk.csv")
     log = replace(log, points=None)  # the tip is what is judged, so the tip alone is fitted
     light = identify(log.only("perlin_0g"), robot, held_out=["perlin_0g@90:"], max_effects=8)
-    return [
-        row("trunk, 0 g", light),
-        heavier(log.only("perlin_100g"), light.identified, light.test.after),
-        *(
-            row(f"trunk, {run}", identify(log.only(run), robot, max_effects=3))
-            for run in ("strokes_out_back", "step_motor2")
-        ),
+    found = [row("trunk, 0 g", light), heavier(log.only("perlin_100g"), light.identified, light.test.after)]
+    return found + [
+        row(f"trunk, {run}", identify(log.only(run), robot, max_effects=3))
+        for run in ("strokes_out_back", "step_motor2")
     ]
 
 
 def stiffer(robot: Robot, factor: float) -> Robot:
-    """The same robot stiffer, its tendons as much: without loads nothing changes, under loads it deflects
-    less."""
-    segments = tuple(
-        replace(
-            s,
-            bending_stiffness=tuple(factor * k for k in s.bending_stiffness),
-            torsional_stiffness=factor * s.torsional_stiffness,
-            tendons=tuple(replace(t, compliance=t.compliance / factor) for t in s.tendons),
-        )
-        for s in robot.segments
-    )
+    """The same robot stiffer, its tendons as much: it deflects less under loads, and as before without."""
+
+    def stiff(s: Segment) -> Segment:
+        tendons = tuple(replace(t, compliance=t.compliance / factor) for t in s.tendons)
+        bending, torsion = tuple(factor * k for k in s.bending_stiffness), factor * s.torsional_stiffness
+        return replace(s, bending_stiffness=bending, torsional_stiffness=torsion, tendons=tendons)
 
     def softer(effect: Any) -> Any:
         if effect["name"] != "tendon_stretch":
             return effect
         return {**effect, "compliance": (np.array(effect["compliance"]) / factor).tolist()}
 
-    return replace(robot, segments=segments, effects=tuple(softer(effect) for effect in robot.effects))
+    effects = tuple(softer(effect) for effect in robot.effects)
+    return replace(robot, segments=tuple(stiff(segment) for segment in robot.segments), effects=effects)
 
 
 def tip_rms(log: RunLog, robot: Robot, start: float, end: float) -> float:
@@ -121,9 +104,8 @@ def heavier(log: RunLog, robot: Robot, light: float) -> Found:
 def armlab() -> list[Found]:
     """Every fifth cell of the cube of shortenings held out."""
     log, robot = armlab_tdcr(DATA / "armlab_tdcr.csv")
-    return [
-        row("ARM-Lab, held-out cells", identify(log, robot, held_out=sorted(log.runs)[2::5], max_effects=6))
-    ]
+    found = identify(log, robot, held_out=sorted(log.runs)[2::5], max_effects=6)
+    return [row("ARM-Lab, held-out cells", found)]
 
 
 def beam() -> list[Found]:
@@ -134,7 +116,7 @@ def beam() -> list[Found]:
 SETS: dict[str, Callable[[], list[Found]]] = {"armlab": armlab, "beam": beam, "trunk": trunk}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     if not DATA.is_dir():
         raise InputError(f"the measured sets are not at {str(DATA)!r}; set FASTROD_DATA to their folder.")
     found: list[Found] = []
@@ -156,5 +138,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--only", list(SETS), "this set alone"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import sys
@@ -11,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,11 +30,9 @@ PEERS: Sequence[Peer] = (
     *(peer_pybullet.EQUAL, peer_pybullet.HALVES, peer_elastica.PEER),
 )
 IN_ONE_CALL = ", all loads in one call"
-GOAL = 100.0
-"""Smaller error at equal time, or times faster at equal error."""
+GOAL = 100.0  # times as small an error at equal time, or times faster at equal error
 BATCH = 4096
-WITHIN = (1e-4, 1e-6)
-"""Root mean square tip errors that the batch asks for [m]."""
+WITHIN = (1e-4, 1e-6)  # m, root mean square tip errors that the batch asks for
 _SEED = 10
 _ENOUGH = 0.3  # s: a solve is repeated for about so long, and its best time counts
 _MOST = 20
@@ -49,12 +46,9 @@ class Point(NamedTuple):
 
     peer: Peer
     rung: Rung
-    error: float
-    """Root mean square over the load cases of the distance from the true tip [m]."""
-    time: float
-    """CPU time of one solve, all threads, mean over the load cases [s]: on an idle core it is wall time."""
-    ready: float
-    """Wall time of building and of the first solve, compilation included [s]."""
+    error: float  # m, root mean square over the load cases of the distance from the true tip
+    time: float  # s of CPU, all threads, mean over the load cases: on an idle core it is wall time
+    ready: float  # s of wall time to build and to solve for the first time, compilation included
 
 
 @contextmanager
@@ -139,9 +133,10 @@ def error_ratio(error: float, used: float, own: Sequence[tuple[float, float]]) -
     return Ratio(error / between(used, times, errors))
 
 
-def best_of(*ratios: Ratio) -> float:
-    """The larger one; nan counts as nothing."""
-    return max((ratio.value for ratio in ratios if not math.isnan(ratio.value)), default=0.0)
+def both_ratios(point: Point, own: Sequence[tuple[float, float]]) -> tuple[Ratio, Ratio, float]:
+    """Of time, of error, and the larger one; nan counts as nothing."""
+    ratios = time_ratio(*point[2:4], own), error_ratio(*point[2:4], own)
+    return *ratios, max((ratio.value for ratio in ratios if not math.isnan(ratio.value)), default=0.0)
 
 
 def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]) -> Section:
@@ -150,11 +145,10 @@ def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]
         row: Row = {"peer": point.peer.name, "setting": point.rung.label, "error_m": point.error}
         row |= {"us": 1e6 * point.time, "ready_s": point.ready}
         if point.peer.family != "fastrod":
-            ratios = {"time": time_ratio(*point[2:4], own), "error": error_ratio(*point[2:4], own)}
-            for name, ratio in ratios.items():
+            *ratios, better = both_ratios(point, own)
+            for name, ratio in zip(("time", "error"), ratios, strict=True):
                 row |= {f"{name}_ratio": ratio.value, f"{name}_ratio_is_least": ratio.least}
                 row[f"{name}_text"] = str(ratio)
-            better = best_of(*ratios.values())
             row |= {"better": better, "met": better >= GOAL}
         rows.append(row)
     return table(
@@ -181,18 +175,14 @@ def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]
 def kinds_section(points: Sequence[Point]) -> Section:
     """One row a peer: the least and the largest of its ratios, and what else there is to know of it."""
     own, rows, notes = own_front(points), [], []
-    for peer in dict.fromkeys(point.peer.name for point in points):
-        mine = [point for point in points if point.peer.name == peer]
-        if mine[0].peer in PEERS:
-            notes.append(
-                f"{peer} ({mine[0].peer.versions()}): {mine[0].peer.same} Besides: {mine[0].peer.also}"
-            )
-        if mine[0].peer.family == "fastrod":
+    for peer in dict.fromkeys(point.peer for point in points):
+        mine = [point for point in points if point.peer is peer]
+        if peer in PEERS:
+            notes.append(f"{peer.name} ({peer.versions()}): {peer.same} Besides: {peer.also}")
+        if peer.family == "fastrod":
             continue
-        faster = [time_ratio(*point[2:4], own) for point in mine]
-        closer = [error_ratio(*point[2:4], own) for point in mine]
-        better = [best_of(*pair) for pair in zip(faster, closer, strict=True)]
-        row: Row = {"peer": peer, "settings": len(mine), "error_m": min(point.error for point in mine)}
+        faster, closer, better = zip(*(both_ratios(point, own) for point in mine), strict=True)
+        row: Row = {"peer": peer.name, "settings": len(mine), "error_m": min(point.error for point in mine)}
         row |= {"faster": _range(faster), "closer": _range(closer), "least": min(better)}
         rows.append(row | {"met": sum(value >= GOAL for value in better), "all_met": min(better) >= GOAL})
     return table(
@@ -212,8 +202,7 @@ def _range(ratios: Sequence[Ratio]) -> str:
 
 
 def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
-    """Each peer at its coarsest setting that is good enough; those that have none are left out by a
-    sentence."""
+    """Each peer at its coarsest setting that is good enough; where none is, a sentence says so."""
     force = np.random.default_rng(_SEED).uniform(appendix_j.FORCES[0], appendix_j.FORCES[-1], n)
     rows: list[Row] = []
     failed: list[str] = []
@@ -269,13 +258,9 @@ def plot(points: Sequence[Point], file: str) -> None:
         for peer in dict.fromkeys(point.peer for point in points):
             mine = [(point.time * 1e6, point.error) for point in points if point.peer is peer]
             k = drawn[peer.family] = drawn.get(peer.family, -1) + 1
-            looks = {
-                "color": COLOURS[peer.family],
-                "marker": "os^Dvp"[k],
-                "linestyle": ("-", "--", ":", "-.")[k % 4],
-            }
+            looks = {"color": COLOURS[peer.family], "marker": "os^Dvp"[k], "label": peer.name}
             looks |= {"linewidth": 2.5, "zorder": 3} if peer.family == "fastrod" else {"linewidth": 1.3}
-            axes.loglog(*zip(*mine, strict=True), label=peer.name, **looks)
+            axes.loglog(*zip(*mine, strict=True), linestyle=("-", "--", ":", "-.")[k % 4], **looks)
         axes.set_xlabel("time of one solve [µs], one core, warm")
         axes.set_ylabel("tip error, rms over the load cases [m]")
         title = "Passive rod of Appendix J under a tip force, at rest: further down and left is better"
@@ -290,7 +275,7 @@ COLOURS |= {"PyBullet": "#009e73", "PyElastica": "#e69f00"}
 """Of Okabe and Ito: distinct for the colour-blind; markers and dashes distinguish the peers of a family."""
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """Measure every peer that is installed, and draw."""
     left_out = [sentence for peer in PEERS if (sentence := peer.missing())]
     force = appendix_j.FORCES[::6] if options.quick else appendix_j.FORCES
@@ -313,5 +298,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--plot", str, "draw error against time into this .png"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,10 @@
-"""The rod solver's figures: a pass and its arithmetic, full solves beside scipy, PyElastica, memory,
-start."""
+"""The rod solver's figures: a pass, its arithmetic, full solves beside scipy, PyElastica, memory, start."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -35,12 +33,10 @@ class Timed:
     case: Case
     forces: bool
     points: int
-    seconds: list[float]
-    """Of one step of the batch, on one thread and on several [s]."""
+    seconds: list[float]  # of one step of the batch, on one thread and on several [s]
     settled: TipError
     moving: TipError
-    travel: float
-    """Median displacement of the tip in one step [m]."""
+    travel: float  # median displacement of the tip in one step [m]
 
     @property
     def head(self) -> Row:
@@ -91,15 +87,11 @@ def time_section(rows: list[Timed], n_robots: int) -> Section:
     one, many = thread_counts()
     made = []
     for row in rows:
-        us = [1e6 * t / n_robots for t in row.seconds]
-        each = [t / row.case.robot.n_segments for t in us]
-        made.append(
-            row.head
-            | {"points": row.points, "us_one": us[0], "us_many": us[1], "us_segment_one": each[0]}
-            | {"us_segment_many": each[1], "ratio": us[0] / us[1]}
-            | {"error_max_m": row.settled.largest, "error_median_m": row.settled.median}
-            | goal(row.settled.largest, cases.TIP_ERROR)
-        )
+        us, n = [1e6 * t / n_robots for t in row.seconds], row.case.robot.n_segments
+        line = row.head | {"points": row.points, "us_one": us[0], "us_many": us[1], "ratio": us[0] / us[1]}
+        line |= {"us_segment_one": us[0] / n, "us_segment_many": us[1] / n}
+        line |= {"error_max_m": row.settled.largest, "error_median_m": row.settled.median}
+        made.append(line | goal(row.settled.largest, cases.TIP_ERROR))
     return table(
         "observer_pass",
         "One observer pass: time and accuracy",
@@ -130,8 +122,8 @@ def lag_section(rows: list[Timed]) -> Section:
             | {"settled_error_max_m": row.settled.largest, "compared": row.moving.compared}
             for row in rows
         ),
-        "The tip that the last timed pass itself gave, whose boundary was predicted before the pass. The "
-        "inputs swing by 5 % of the difference to other random inputs, 200 steps a cycle.",
+        "The tip that the last timed pass itself gave. The inputs swing by 5 % of the difference to other "
+        "random inputs, 200 steps a cycle.",
     )
 
 
@@ -146,17 +138,14 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
     }
     made = []
     for row in rows:
-        tally = sum(tallies[row.forces][row.case.key].values(), flops.Tally())
+        tally = tallies[row.forces][row.case.key]
         slow = tally.divide + tally.root
         done = [n_robots / t for t in row.seconds]
         floor = (tally.instructions - slow) / fma + slow / divide
-        made.append(
-            row.head
-            | {"columns": row.columns, "flops": tally.flops, "instructions": tally.instructions, "slow": slow}
-            | {"gflops_one": 1e-9 * tally.flops * done[0], "gflops_many": 1e-9 * tally.flops * done[1]}
-            | {"peak_one": tally.flops * done[0] / (2.0 * fma), "floor_us": 1e6 * floor}
-            | {"fraction_one": floor * done[0], "fraction_many": floor * done[1] / many}
-        )
+        line = row.head | {"columns": row.columns, "flops": tally.flops, "instructions": tally.instructions}
+        line |= {"gflops_one": 1e-9 * tally.flops * done[0], "gflops_many": 1e-9 * tally.flops * done[1]}
+        line |= {"slow": slow, "peak_one": tally.flops * done[0] / (2.0 * fma), "floor_us": 1e6 * floor}
+        made.append(line | {"fraction_one": floor * done[0], "fraction_many": floor * done[1] / many})
     return table(
         "arithmetic",
         "The same passes: arithmetic",
@@ -169,8 +158,7 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
         f"Peak: {2e-9 * fma:.1f} GFLOP/s of fused multiply-adds in registers, measured here on {one} thread, "
         f"and as much for each thread. A division takes the time of {fma / divide:.1f} of them.",
         "Operations fused: a product and a sum that can fuse are one. Floor: these at the rate of "
-        "multiply-adds, divisions and square roots at that of divisions: the time a robot if nothing was "
-        "loaded or waited for.",
+        "multiply-adds, divisions and square roots at that of divisions.",
     )
 
 
@@ -202,7 +190,7 @@ def cantilever_section() -> Section:
     )
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """All tables, one after the other in this process (memory and start: in processes of their own)."""
     quick = options.quick
     n_robots = 256 if quick else 8192
@@ -221,5 +209,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from fastrod import Simulator
+from fastrod.control import FixedBase, ResolvedRate, SoftTip, Trajectory
+from fastrod_scenes import load
+from fastrod_scenes.ur5.soft_ur5 import DEPTH, DOWN, LARGEST_BEND, OFFSET, STRAIGHT, track_robot
+from fastrod_scenes.ur5.tracking import APPROACH, PERIOD, Record, TrackingError, TrackingScene, record
 from report import Row, Section, bench, goal, note_progress, table
-
-if TYPE_CHECKING:
-    from fastrod.control import Trajectory
-    from fastrod_scenes.ur5.tracking import Record, TrackingError, TrackingScene
 
 ERROR_TARGET, FRACTION_TARGET = 1e-6, 0.5
 """Mean squared error after the approach [m^2], and the soft robot's fraction of the motion."""
 SCENES = ("track_square", "track_circle", "track_figure_eight", "track_helix", "track_square_helix")
-POINTS = 40
-"""Of a period, for the soft robot's workspace."""
-DEPTHS = np.arange(0.02, 0.235, 0.01)
-"""Of a path's center below the base of the soft robot [m]."""
-SCALES = np.arange(1.0, 0.0, -0.05)
-"""Of a path."""
-NEAR = 1e-5
-"""A point this near is in the workspace [m]."""
+POINTS = 40  # of a period, for the soft robot's workspace
+DEPTHS = np.arange(0.02, 0.235, 0.01)  # m, of a path's center below the base of the soft robot
+SCALES = np.arange(1.0, 0.0, -0.05)  # of a path
+NEAR = 1e-5  # a point this near is in the workspace [m]
 
 
 class Workspace:
     """Inverse kinematics of the soft robot alone, its base fixed above a path's center and its tip down."""
 
     def __init__(self) -> None:
-        from fastrod import Simulator
-        from fastrod.control import FixedBase, ResolvedRate, SoftTip
-        from fastrod_scenes.ur5.soft_ur5 import DOWN, LARGEST_BEND, OFFSET, STRAIGHT, track_robot
-
         self.tip = SoftTip(Simulator(track_robot(), threads=1), FixedBase((0.0, 0.0, 0.0, *DOWN)))
         self.low, self.high = self.tip.limits(LARGEST_BEND)
         # in the same metric as the tracks: extension by its range, bends by a radian
@@ -62,8 +53,7 @@ class Workspace:
         return None
 
     def points(self, path: Trajectory, depth: float, whole: bool) -> float:
-        """Fraction of the path's points that are in the workspace; with `whole`, 0 after the first that is
-        not."""
+        """Fraction of the path's points in the workspace; with `whole`, 0 after the first that is not."""
         start = np.array(path.center) + np.array([0.0, 0.0, depth])
         targets = path.position(np.arange(POINTS + 1) * path.period / POINTS) - start
         found, last = 0, []
@@ -81,8 +71,8 @@ class Workspace:
         return found / len(targets)
 
     def best(self, scene: TrackingScene) -> tuple[float, float, float]:
-        """Largest fraction of the path from one place of the base; the largest scale at which all of it is
-        in the workspace; a depth for that."""
+        """Largest fraction of the path from one place of the base; the largest scale at which all of it is in
+        the workspace; a depth for that."""
         most = max(self.points(scene.path(), depth, False) for depth in DEPTHS[::2])
         for scale in SCALES:
             depths = [depth for depth in DEPTHS if self.points(scene.path(scale), depth, True) == 1.0]
@@ -93,7 +83,6 @@ class Workspace:
 
 def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Record, Row]:
     """One run, and its errors by name."""
-    from fastrod_scenes.ur5.tracking import APPROACH, PERIOD, TrackingError, record
 
     def steps(stage: TrackingError) -> Iterator[float]:
         try:
@@ -106,17 +95,12 @@ def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Reco
     note_progress(name)
     stage = TrackingError(*given, **options)
     run = record(stage, steps(stage))
-    errors = run.mean_square(APPROACH), run.mean_square(0.0, PERIOD)
-    return run, {f"{name}_after": errors[0], f"{name}_with": errors[1]}
+    errors = {"after": run.mean_square(APPROACH), "with": run.mean_square(0.0, PERIOD)}
+    return run, {f"{name}_{kind}": error for kind, error in errors.items()}
 
 
 def track(name: str, workspace: Workspace | None, dt: float | None, seconds: float | None) -> Row:
-    """One path by both, by the arm alone and by the soft robot alone; without `workspace` the last as far
-    as it needs no search."""
-    from fastrod_scenes import load
-    from fastrod_scenes.ur5.soft_ur5 import DEPTH
-    from fastrod_scenes.ur5.tracking import APPROACH
-
+    """One path by both, by the arm alone and by the soft robot alone, at the scale of `workspace`."""
     scene: Any = load(name)
     note_progress(name)
     dt, seconds = dt or scene.dt, seconds or scene.duration
@@ -124,26 +108,15 @@ def track(name: str, workspace: Workspace | None, dt: float | None, seconds: flo
     by_soft, by_arm = both.lengths(APPROACH)
     moved = both.soft_fraction(APPROACH)
     within, scale, depth = workspace.best(scene) if workspace else (1.0, 0.5, DEPTH)
-    return {
-        "path": scene.shape,
-        "paper": scene.paper,
-        **found,
-        **goal(found["both_after"], ERROR_TARGET, name="error_"),
-        "fraction": moved,
-        **goal(moved, FRACTION_TARGET, least=True, name="fraction_"),
-        "by_soft": by_soft,
-        "by_arm": by_arm,
-        "lag": both.lag,
-        "clearance": both.clearance,
-        **played("arm", seconds, scene.path(), dt=dt, movers="arm")[1],
-        "within": within,
-        "scale": scale,
-        "depth": depth,
-        **played("soft", seconds, scene.path(scale), dt=dt, movers="soft", depth=depth)[1],
-    }
+    row: Row = {"path": scene.shape, "paper": scene.paper, "lag": both.lag, "clearance": both.clearance}
+    row |= found | goal(found["both_after"], ERROR_TARGET, name="error_") | {"fraction": moved}
+    row |= goal(moved, FRACTION_TARGET, least=True, name="fraction_")
+    row |= {"by_soft": by_soft, "by_arm": by_arm, "within": within, "scale": scale, "depth": depth}
+    row |= played("arm", seconds, scene.path(), dt=dt, movers="arm")[1]
+    return row | played("soft", seconds, scene.path(scale), dt=dt, movers="soft", depth=depth)[1]
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """The tracks, and the parts of the motion."""
     workspace = None if options.quick else Workspace()
     seconds = 2.5 if options.quick else None
@@ -158,12 +131,10 @@ def measure(options: argparse.Namespace) -> list[Section]:
             "| arm_with:.1e with it~m^2 | within:.2f soft alone:~in workspace | scale:.2f tracked~at scale"
             "| depth:.2f base above~center m | soft_after:.1e after~m^2 | soft_with:.1e with it~m^2",
             rows,
-            "A period is 20 s. The goal is on the path from t = 0 on, the tip rests at the path's center "
-            "(soft alone: straight below its base). With the approach: the first 20 s from the jump on; "
-            "after it: 20 s from t = 2 s on.",
-            "Soft alone: the UR5's joints are held, the base is above the center. In workspace: fraction of "
-            "the full-size path that inverse kinematics finds from the best height; then the largest scale "
-            "at which it finds all, in steps of 0.05.",
+            "A period is 20 s. The tip begins at rest at the path's center (soft alone: straight below its "
+            "base). With the approach: the first 20 s from the jump on; after it: 20 s from t = 2 s on.",
+            "In workspace: fraction of the full-size path that inverse kinematics finds from the best "
+            "height; then the largest scale at which it finds all, in steps of 0.05.",
             "The paper moves both; its figures are those of SoftManiSim (CoRL 2024).",
         ),
         table(
@@ -182,5 +153,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--dt", float, "time step [s], by default the scenes'"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,7 @@
-"""The viewer in a real browser: answer to a slider, load of the server, start, memory.
-
-Needs Debian's chromium and playwright. `--minutes` of motion with pages that come and go, for memory (10
-for the whole check).
-"""
+"""The viewer in a real browser: answer to a slider, load of the server, start, memory."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -23,10 +18,8 @@ import numpy as np
 from fastrod.errors import InputError
 from report import Row, Section, bench, goal, note_progress, table
 
-PAGES = 5
-"""That come and go."""
-STAY = 12.0
-"""Of a page [s]."""
+PAGES = 5  # that come and go
+STAY = 12.0  # of a page [s]
 
 
 def check_installed() -> None:
@@ -49,23 +42,6 @@ def browser() -> Iterator[Any]:
         found.close()
 
 
-@contextmanager
-def serving(*words: str, port: int) -> Iterator[tuple[Any, str]]:
-    """`fastrod view` in a process of its own, and the address that it would open a browser with."""
-    import psutil
-
-    command = [sys.executable, "-m", "fastrod.commands.cli", "view", *words, "--port", str(port)]
-    environment = {**os.environ, "BROWSER": "echo"}  # prints the address when a browser is opened
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen(command, env=environment, **pipes) as process:
-        try:
-            assert process.stdout is not None
-            yield psutil.Process(process.pid), process.stdout.readline().strip()
-        finally:
-            process.terminate()
-            process.communicate(timeout=20)
-
-
 def wait_for_controls(page: Any, address: str, seconds: float = 120.0) -> None:
     """Load a page as soon as it is served, and wait until it has its controls."""
     end = time.monotonic() + seconds
@@ -82,22 +58,30 @@ def wait_for_controls(page: Any, address: str, seconds: float = 120.0) -> None:
 
 
 @contextmanager
-def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, Any, float]]:
-    """Chromium, the server's process, its address, a window with its controls, and the time that this took
-    [s]."""
+def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, float]]:
+    """Chromium with a window on `fastrod view`, that server's process, its address, and the time to its
+    controls [s]."""
+    import psutil
     from windows import Window
 
+    command = [sys.executable, "-m", "fastrod.commands.cli", "view", *words, "--port", str(port)]
+    environment = {**os.environ, "BROWSER": "echo"}  # prints the address when a browser is opened
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     with browser() as chromium:
         window, began = Window(chromium), time.perf_counter()
-        with serving(*words, port=port) as (process, address):
-            wait_for_controls(window.page, address)
-            yield chromium, process, address, window, time.perf_counter() - began
+        with subprocess.Popen(command, env=environment, **pipes) as server:
+            try:
+                address = server.stdout.readline().strip()
+                wait_for_controls(window.page, address)
+                yield chromium, psutil.Process(server.pid), address, time.perf_counter() - began
+            finally:
+                server.terminate()
+                server.communicate(timeout=20)
         window.close()
 
 
 def answers(presses: int) -> list[float]:
-    """From a key on a slider to the change of the simulator's state, each [s]; browser and server in one
-    machine, one page."""
+    """From a key on a slider to the change of the simulator's state, each [s]; one page."""
     from windows import Window
 
     from fastrod_viewer.app import App
@@ -140,7 +124,6 @@ def answers(presses: int) -> list[float]:
 
 
 def load(what: str, seconds: float, port: int) -> float:
-    """Per cent of a core that the server takes while its script plays for one page."""
     note_progress(f"load, {what}")
     with shown(what, "--play", port=port) as (_, process, *_):
         time.sleep(4.0)
@@ -151,7 +134,6 @@ def load(what: str, seconds: float, port: int) -> float:
 
 
 def start(port: int) -> float:
-    """From the command to a page with its controls [s], kernels from the cache, the browser open."""
     note_progress("start")
     with shown("five_segment_reacher", port=port) as (*_, taken):
         return taken
@@ -185,22 +167,18 @@ def memory(minutes: float, port: int) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     check_installed()
     port, seconds = options.port, 3.0 if options.quick else 20.0
     note_progress("answer to a slider")
     taken = 1e3 * np.array(answers(6 if options.quick else 60))
+    loads = [load(what, seconds, port) for what in ("five_segment_reacher", "grid")]
     rows = [
         ("slider to server state, median", float(np.median(taken)), "ms", 80.0),
         ("slider to server state, 95 %", float(np.quantile(taken, 0.95)), "ms", 150.0),
         ("page ready from `fastrod view`", start(port), "s", 5.0),
-        (
-            "server, one five-segment robot at 30 Hz",
-            load("five_segment_reacher", seconds, port),
-            "% of a core",
-            10.0,
-        ),
-        ("server, 64 five-segment robots at 30 Hz", load("grid", seconds, port), "% of a core", 60.0),
+        ("server, one five-segment robot at 30 Hz", loads[0], "% of a core", 10.0),
+        ("server, 64 five-segment robots at 30 Hz", loads[1], "% of a core", 60.0),
     ]
     found = memory(0.2 if options.quick else options.minutes, port)
     growth = 100.0 * (found[-1]["value"] / found[1 if len(found) > 1 else 0]["value"] - 1.0)
@@ -209,12 +187,8 @@ def measure(options: argparse.Namespace) -> list[Section]:
             "viewer",
             "The viewer, one page",
             "what | value:.3g measured | unit | target:g | met",
-            (
-                {"what": what, "value": value, "unit": unit, **goal(value, target)}
-                for what, value, unit, target in rows
-            ),
-            f"{len(taken)} key presses on a slider. Chromium draws in software beside the server, on "
-            f"{os.cpu_count()} cores.",
+            [{"what": what, "value": x, "unit": unit, **goal(x, target)} for what, x, unit, target in rows],
+            f"{len(taken)} key presses on a slider; {os.cpu_count()} cores.",
         ),
         table(
             "memory",
@@ -228,5 +202,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--minutes", 2.0, "of motion, for memory"), ("--port", 8471, "of the server"))
-if __name__ == "__main__":
-    sys.exit(main())

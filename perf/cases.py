@@ -12,23 +12,18 @@ from fastrod import Robot, Simulator, State, load_robot
 from report import SHARED
 
 Array = NDArray[np.float64]
-TIP_ERROR = 3e-6
-"""Tip error that every timed row keeps against a fine solution [m]."""
-N_FINE = 40
-"""Points per segment of the fine solution; at least four times those of any row."""
+TIP_ERROR = 3e-6  # tip error that every timed row keeps against a fine solution [m]
+N_FINE = 40  # points per segment of the fine solution; at least four times those of any row
 STEPS_PER_CASE = 5
-LINE = (1.0, 1.0, 1.0)
-"""Line force of Appendix B, world [N/m]."""
+LINE = (1.0, 1.0, 1.0)  # line force of Appendix B, world [N/m]
 
 
 @dataclass(frozen=True)
 class Pose:
     """Inputs of a batch at one moment."""
 
-    tendon_length: Array
-    """(n_robots, n_tendons) [m]."""
-    tip_force: Array
-    """(n_robots, 3) world [N]."""
+    tendon_length: Array  # (n_robots, n_tendons) [m]
+    tip_force: Array  # (n_robots, 3) world [N]
 
     def mixed(self, other: Pose, fraction: Any, forces: bool = True) -> Pose:
         """This pose moved by a fraction of the difference to another; the forces too, or only the lengths."""
@@ -48,8 +43,7 @@ class Case:
     robot: Robot
     here: Pose
     there: Pose
-    line_force: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World [N/m]."""
+    line_force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world [N/m]
 
     def at(self, step: int, forces: bool) -> Pose:
         """Inputs at a time step: a tenth of the difference from `here` to `there` and back in 200 steps."""
@@ -61,8 +55,7 @@ class Case:
 
 
 def appendix_b_robot(paper: bool) -> Robot:
-    """The prototype with its tendons at 0.01 m, as in Appendix B; in paper mode or with the full tendon
-    model."""
+    """The prototype with its tendons at 0.01 m, as in Appendix B; paper mode or the full tendon model."""
     robot = load_robot("prototype")
     (segment,) = robot.segments
     tendons = tuple(replace(tendon, offset=0.01) for tendon in segment.tendons)
@@ -87,8 +80,7 @@ _COLUMNS = ("L1 L2 L3 L4", "Fx Fy Fz")
 
 
 def path() -> Pose:
-    """The 500 points of Appendix B: from each case to the next in `STEPS_PER_CASE` steps, the last to the
-    first."""
+    """The 500 points of Appendix B: from case to case in `STEPS_PER_CASE` steps, the last to the first."""
     cases, _ = appendix_b()
     n = len(cases.tip_force)
     case, step = np.divmod(np.arange(n * STEPS_PER_CASE), STEPS_PER_CASE)
@@ -142,8 +134,7 @@ class TipError(NamedTuple):
 
     largest: float
     median: float
-    compared: float
-    """Fraction of the robots that were solved."""
+    compared: float  # fraction of the robots that were solved
 
 
 def tip_error(tip: Array, truth: Array, ok: NDArray[np.bool_]) -> TipError:
@@ -166,8 +157,7 @@ def fine_solution(case: Case, pose: Pose, outputs: Any = "tip") -> tuple[Simulat
 def settled(
     case: Case, pose: Pose, points: int, fine: Simulator, threads: int | None = None
 ) -> tuple[Simulator, State]:
-    """A simulator with `points` per segment, settled from the boundary of a fine one, so on the same
-    branch."""
+    """A simulator with `points` per segment, settled from the boundary of a fine one: on its branch."""
     n = len(pose.tip_force)
     sim = Simulator(case.robot, n, points_per_segment=points, outputs="tip", threads=threads)
     sim.restore(fine.snapshot())

@@ -8,32 +8,27 @@ step that says ok and is deeper than 0.1 mm is silent.
 
 from __future__ import annotations
 
-import argparse
 import re
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy.spatial.transform import Rotation
 
-import report
 from cases import Array, arc_lengths
 from fastrod import Robot, Simulator, load_robot, robot_names
 from fastrod.contact import ContactScene, Obstacle, box, capsule, cylinder, mesh, sphere
-from report import Column, Row, Section
+from report import Row, Section, bench, note_progress, table
 
-SILENT = 1e-4
-"""Depth beyond which a step must not say ok [m]."""
-TOGETHER = 8
-"""Scenes of one batch: one robot, one geometry, each its own poses and motion."""
+SILENT = 1e-4  # m, depth beyond which a step must not say ok
+TOGETHER = 8  # scenes of one batch: one robot, one geometry, each its own poses and motion
 N_STEPS = 10
+# m between samples along a rod: between two the depth changes by less than 0.02 mm on a rod of 2 mm radius
 _SAMPLE = 5e-4
-"""Distance of the samples along a rod [m]; between two the depth changes by less than 0.02 mm on a rod of 2
-mm radius."""
 _POINTS = (6, 8, 10, 12, 16, 20, 30, 40)
 
 
@@ -67,8 +62,7 @@ def _mesh_distances(points, corners, out):  # type: ignore[no-untyped-def]
 
 
 def _encloses(point: Array, corners: Array) -> bool:
-    """Whether a closed mesh holds the point, by the solid angle of its triangles (Van Oosterom and Strackee
-    1983)."""
+    """Whether a closed mesh holds the point: solid angle of its triangles (Van Oosterom, Strackee 1983)."""
     a, b, c = (corners[:, k] - point for k in range(3))
     x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dots = (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
@@ -76,20 +70,9 @@ def _encloses(point: Array, corners: Array) -> bool:
     return bool(angle.sum() > 2.0 * np.pi)
 
 
-def turned(quaternion: Array) -> Array:
-    """(..., 3, 3) world_from_body of (..., 4) w x y z."""
-    w, x, y, z = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-
-
 def distances(obstacle: Obstacle, pose: Array, points: Array) -> Array:
     """(n,) signed distance of world points (n, 3) to an obstacle at a pose (7,): negative inside [m]."""
-    p = (points - pose[:3]) @ turned(pose[3:])
+    p = Rotation.from_quat(pose[[4, 5, 6, 3]]).inv().apply(points - pose[:3])
     a, b, c = obstacle.size
     if obstacle.shape == "sphere":
         return np.asarray(np.linalg.norm(p, axis=1) - a)
@@ -112,56 +95,40 @@ def distances(obstacle: Obstacle, pose: Array, points: Array) -> Array:
     return d
 
 
-def _noisy(rng: np.random.Generator, size: float) -> Any:
-    import trimesh
-
-    solid = trimesh.creation.icosphere(subdivisions=2, radius=size)
-    solid.vertices *= 1.0 + 0.06 * rng.uniform(-1.0, 1.0, (len(solid.vertices), 1))
-    return solid
-
-
 def _made(kind: str, rng: np.random.Generator, size: float) -> Any:
     """A mesh of trimesh.creation, about `size` [m] wide."""
     import trimesh
 
-    make, r = trimesh.creation, rng.uniform
+    make, r, n = trimesh.creation, rng.uniform, rng.integers
     if kind == "ball":
-        return make.icosphere(subdivisions=int(rng.integers(1, 4)), radius=0.5 * size)
+        return make.icosphere(subdivisions=int(n(1, 4)), radius=0.5 * size)
     if kind == "block":
         return make.box(extents=size * r(0.3, 1.0, 3))
     if kind == "bar":
-        return make.cylinder(
-            radius=size * r(0.1, 0.4), height=size * r(0.5, 2.0), sections=int(rng.integers(8, 48))
-        )
+        return make.cylinder(size * r(0.1, 0.4), size * r(0.5, 2.0), sections=int(n(8, 48)))
     if kind == "pill":
         return make.capsule(radius=size * r(0.15, 0.4), height=size * r(0.3, 1.0), count=[12, 12])
     if kind == "annulus":
         inner = size * r(0.2, 0.4)
-        return make.annulus(
-            inner, inner + size * r(0.05, 0.3), size * r(0.2, 0.8), sections=int(rng.integers(12, 40))
-        )
+        return make.annulus(inner, inner + size * r(0.05, 0.3), size * r(0.2, 0.8), sections=int(n(12, 40)))
     if kind == "torus":
         return make.torus(size * r(0.3, 0.5), size * r(0.08, 0.2), major_sections=20, minor_sections=10)
     if kind == "cone":
         return make.cone(radius=size * r(0.3, 0.6), height=size * r(0.4, 1.2), sections=16)
     if kind == "noisy sphere":
-        return _noisy(rng, 0.5 * size)
+        solid = make.icosphere(subdivisions=2, radius=0.5 * size)
+        solid.vertices *= 1.0 + 0.06 * r(-1.0, 1.0, (len(solid.vertices), 1))
+        return solid
     return make.box(extents=size * np.array([r(0.02, 0.06), r(0.8, 2.0), r(0.8, 2.0)]))  # thin plate
 
 
 MESHES = ("ball", "block", "bar", "pill", "annulus", "torus", "cone", "noisy sphere", "thin plate")
-PRIMITIVES: dict[str, Callable[[np.random.Generator, float], Obstacle]] = {
-    "sphere": lambda rng, size: sphere(size * rng.uniform(0.2, 0.6), name="sphere"),
-    "box": lambda rng, size: box(size * rng.uniform(0.2, 1.0, 3), name="box"),
-    "cylinder": lambda rng, size: cylinder(
-        size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 2.0), name="cylinder"
-    ),
-    "capsule": lambda rng, size: capsule(
-        size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 1.5), name="capsule"
-    ),
-    "thin box": lambda rng, size: box(
-        size * rng.uniform((0.01, 0.8, 0.8), (0.05, 2.0, 2.0)), name="thin box"
-    ),
+PRIMITIVES: dict[str, Callable[[Any, float], Obstacle]] = {
+    "sphere": lambda r, size: sphere(size * r(0.2, 0.6), name="sphere"),
+    "box": lambda r, size: box(size * r(0.2, 1.0, 3), name="box"),
+    "cylinder": lambda r, size: cylinder(size * r(0.1, 0.4), size * r(0.3, 2.0), name="cylinder"),
+    "capsule": lambda r, size: capsule(size * r(0.1, 0.4), size * r(0.3, 1.5), name="capsule"),
+    "thin box": lambda r, size: box(size * r((0.01, 0.8, 0.8), (0.05, 2.0, 2.0)), name="thin box"),
 }
 KINDS = (*MESHES, *PRIMITIVES)
 
@@ -175,32 +142,28 @@ class Batch:
     kind: str
     obstacle: Obstacle
     rod_radius: float
-    tendon_length: Array
-    """(N_STEPS + 1, n, n_tendons) [m]."""
-    pose: Array
-    """(N_STEPS + 1, n, 7) world."""
+    tendon_length: Array  # (N_STEPS + 1, n, n_tendons) [m]
+    pose: Array  # (N_STEPS + 1, n, 7) world
 
-    def scene(self, **options: Any) -> ContactScene:
-        return ContactScene(obstacles=[self.obstacle], rod_radius=self.rod_radius, **options)
-
-    def sample(self, sim: Simulator) -> tuple[Array, Array]:
-        """Arclengths (n, m) of the samples from where contact begins, and their points (n, m, 3)."""
-        end = sim.state.arclength[:, -1]
-        share = np.linspace(0.0, 1.0, int(np.nanmax(end) / _SAMPLE) + 2)
-        first = 1.5 * self.rod_radius
-        s = first + (np.where(np.isfinite(end), end, 1.0)[:, None] - first) * share
-        return s, sim.shape(np.where(np.isfinite(end)[:, None], np.minimum(s, end[:, None]), 0.0)).position
+    def sample(self, sim: Simulator) -> Array:
+        """Points (n, m, 3) of each rod from where contact begins to its tip."""
+        end, first = sim.state.arclength[:, -1], 1.5 * self.rod_radius
+        known = np.isfinite(end)[:, None]
+        fraction = np.linspace(0.0, 1.0, int(np.nanmax(end) / _SAMPLE) + 2)
+        s = first + (np.where(known, end[:, None], 1.0) - first) * fraction
+        return sim.shape(np.where(known, np.minimum(s, end[:, None]), 0.0)).position
 
 
 def make_batch(seed: int, index: int, n: int = TOGETHER) -> Batch:
-    """Batch `index` of a seed: a robot and an obstacle drawn at random; each scene has its poses and its
-    motion."""
+    """Batch `index` of a seed: a random robot and obstacle; each scene has its poses and its motion."""
     rng = np.random.default_rng((seed, index))
     robot = load_robot(robot_names()[int(rng.integers(len(robot_names())))])
     points, kind = int(rng.choice(_POINTS)), KINDS[int(rng.integers(len(KINDS)))]
     radius = float(rng.choice([0.002, 0.004, 0.012]))
     size = float(rng.uniform(0.02, 0.12)) if kind != "annulus" else float(rng.uniform(5.0, 12.0)) * radius
-    solid = PRIMITIVES[kind](rng, size) if kind in PRIMITIVES else mesh(_made(kind, rng, size), name=kind)
+    solid = (
+        PRIMITIVES[kind](rng.uniform, size) if kind in PRIMITIVES else mesh(_made(kind, rng, size), name=kind)
+    )
     n_moves = int(rng.choice([3, N_STEPS]))  # coarse steps, then rest; or small ones
     most = 1.0 if robot.n_segments == 1 else 0.6 if robot.n_segments == 2 else 0.35
     bend = rng.uniform(-most, most, (2, n, robot.n_segments, 2))
@@ -230,50 +193,43 @@ def _poses(
             at = int(rng.integers(int(0.4 * len(last)), len(last)))
             out = np.cross(free[1][1][i, at, :, 2], rng.normal(size=3))
             out /= np.linalg.norm(out)
-            turn = rng.normal(size=4)
-            turn /= np.linalg.norm(turn)
+            rotation = rng.normal(size=4)
+            rotation /= np.linalg.norm(rotation)
             inside = solid.name == "annulus" and rng.random() < 0.5  # the rod runs through it
             if inside:
-                turn = _along(free[0][1][i, at, :, 2])
+                rotation = _along(free[0][1][i, at, :, 2])
             deep = rng.uniform(0.0, 0.08) * robot.length
             centre = (first if inside else last)[at]
             start, end = 0.0, deep if moves else 0.0
             if not inside:
                 start, end = (
-                    _away(solid, centre, out, turn, nodes, radius + gap)
+                    _away(solid, centre, out, rotation, nodes, radius + gap)
                     for nodes, gap in ((first, 2e-3), (last, -deep))
                 )
                 start, end = (start, end) if moves else (max(start, end),) * 2
-            way = centre + (start + there[:, None] * (end - start)) * out
-            ends = [np.concatenate([c, turn]) for c in (way[0], way[-1])]
+            path = centre + (start + there[:, None] * (end - start)) * out
+            ends = [np.concatenate([c, rotation]) for c in (path[0], path[-1])]
             clear = distances(solid, ends[0], first).min() > radius + 1e-3
-            mounted = (
-                min(
-                    distances(solid, e, nodes[fixed]).min()
-                    for e, nodes in zip(ends, (first, last), strict=True)
-                )
-                > radius + 2e-3
-            )
-            if clear and mounted:
+            near = min(distances(solid, e, x[fixed]).min() for e, x in zip(ends, (first, last), strict=True))
+            if clear and near > radius + 2e-3:
                 break
         else:
-            way = way + 10.0  # no place was found: this one stays free
-        pose[:, i, :3], pose[:, i, 3:] = way, turn
+            path = path + 10.0  # no place was found: this one stays free
+        pose[:, i, :3], pose[:, i, 3:] = path, rotation
     return pose
 
 
 def _along(z: Array) -> Array:
-    """Quaternion that turns the z axis to a unit vector."""
+    """Quaternion that rotates the z axis to a unit vector."""
     q = np.array([1.0 + z[2], -z[1], z[0], 0.0])
     return np.asarray(q / np.linalg.norm(q)) if z[2] > -0.999 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
-def _away(solid: Obstacle, centre: Array, out: Array, turn: Array, nodes: Array, wanted: float) -> float:
-    """How far from `centre` along `out` the obstacle is `wanted` away from these nodes, coming from
-    outside."""
+def _away(solid: Obstacle, centre: Array, out: Array, rotation: Array, nodes: Array, wanted: float) -> float:
+    """Distance along `out` at which the obstacle is `wanted` away from the nodes, coming from outside."""
 
-    def clear(way: float) -> bool:
-        return bool(distances(solid, np.concatenate([centre + way * out, turn]), nodes).min() > wanted)
+    def clear(away: float) -> bool:
+        return bool(distances(solid, np.concatenate([centre + away * out, rotation]), nodes).min() > wanted)
 
     near = far = 0.4
     while near > 0.0 and clear(near):
@@ -286,18 +242,13 @@ def _away(solid: Obstacle, centre: Array, out: Array, turn: Array, nodes: Array,
 
 @dataclass
 class Played:
-    """What became of a batch."""
+    """What became of a batch; arrays (N_STEPS + 1, n) but for the time."""
 
     kind: str
     ok: Any
-    """(N_STEPS + 1, n)"""
     touching: Any
-    """(N_STEPS + 1, n)"""
-    depth: Array
-    """(N_STEPS + 1, n) of the sampled rod in the obstacle, negative where it is clear [m]; nan where there is
-    no shape."""
-    seconds: Array
-    """(N_STEPS + 1,) of the processor, one call."""
+    depth: Array  # of the sampled rod in the obstacle, negative where it is clear [m]; nan without a shape
+    seconds: Array  # (N_STEPS + 1,) of the processor, one call
     passes: Any
     sentences: list[str] = field(default_factory=list)
 
@@ -306,121 +257,90 @@ def play(batch: Batch, rows: list[int] | None = None, **options: Any) -> Played:
     """Step a batch, or some of its scenes, and sample every rod after every step."""
     some = list(range(batch.pose.shape[1])) if rows is None else rows
     n, name = len(some), batch.obstacle.name
-    sim = Simulator(
-        batch.robot, n, points_per_segment=batch.points, threads=1, contact=batch.scene(**options)
-    )
-    ok, touching, passes = (np.zeros((N_STEPS + 1, n), kind) for kind in (bool, bool, int))
-    played = Played(
-        batch.kind, ok, touching, np.full((N_STEPS + 1, n), np.nan), np.zeros(N_STEPS + 1), passes
-    )
+    scene = ContactScene(obstacles=[batch.obstacle], rod_radius=batch.rod_radius, **options)
+    sim = Simulator(batch.robot, n, points_per_segment=batch.points, threads=1, contact=scene)
+    ok, touching, passes, depth = (np.zeros((N_STEPS + 1, n), kind) for kind in (bool, bool, int, float))
+    played = Played(batch.kind, ok, touching, depth * np.nan, np.zeros(N_STEPS + 1), passes)
     for k in range(N_STEPS + 1):
         begin = time.process_time()
         state = sim.step(batch.tendon_length[k][some], obstacle_pose={name: batch.pose[k][some]})
         played.seconds[k] = time.process_time() - begin
         assert state.contacts is not None
-        played.ok[k], played.touching[k], played.passes[k] = (
-            state.ok,
-            state.contacts.in_contact(),
-            state.passes,
-        )
+        ok[k], touching[k], passes[k] = state.ok, state.contacts.in_contact(), state.passes
         played.sentences += list(state.problems.values())
-        _, points = batch.sample(sim)
-        for i in range(n):
-            if np.isfinite(points[i]).all():
-                played.depth[k, i] = (
-                    batch.rod_radius - distances(batch.obstacle, batch.pose[k][some[i]], points[i]).min()
-                )
+        for i, points in enumerate(batch.sample(sim)):
+            if np.isfinite(points).all():
+                near = distances(batch.obstacle, batch.pose[k][some[i]], points).min()
+                played.depth[k, i] = batch.rod_radius - near
     return played
 
 
-def measure(
-    count: int, seed: int, first: int = 0, minutes: float = np.inf
-) -> Iterator[tuple[int, Batch, Played]]:
-    """Batches from index `first` on, until `count` scenes are played or the time is over."""
-    end = time.monotonic() + 60.0 * minutes
-    for index in range(first, first + -(-count // TOGETHER)):
-        if time.monotonic() > end:
-            return
-        report.note_progress(f"batch {index}")
-        batch = make_batch(seed, index)
-        yield index, batch, play(batch)
-
-
-def sections(count: int, seed: int, first: int, minutes: float) -> list[Section]:
-    """The table by kind, and the sentences."""
-    play(make_batch(seed, first))  # compiled, and not timed
-    found: dict[str, list[Played]] = {kind: [] for kind in KINDS}
-    said: Counter[str] = Counter()
-    silent: list[str] = []
-    slowest, where = 0.0, ""
-    taken: list[float] = []
-    for index, batch, played in measure(count, seed, first, minutes):
-        found[batch.kind].append(played)
-        said.update(re.sub(r"-?\d[\d.e+-]*", "#", sentence) for sentence in played.sentences)
-        for k, i in np.argwhere(played.ok & (played.depth > SILENT)):
-            silent.append(
-                f"seed {seed} batch {index} scene {i} step {k}: {1e3 * played.depth[k, i]:.3f} "
-                f"mm, {batch.robot.name}, "
-                f"{batch.points} steps a segment, {batch.kind}"
-            )
-        each = played.seconds[1:]
-        taken += list(each)
-        if each.max() > slowest:
-            slowest, where = (
-                float(each.max()),
-                (f"batch {index}, {batch.robot.name}, {batch.points} steps a segment, {batch.kind}"),
-            )
-        if not played.ok.all() and sys.stderr.isatty():
-            print(f"batch {index}: not ok {np.argwhere(~played.ok).tolist()}", file=sys.stderr)
-    rows: list[Row] = []
-    every = [p for played in found.values() for p in played]
-    for kind, some in [*found.items(), ("all", every)]:
-        if not some:
-            continue
-        ok, depth = (np.concatenate([getattr(p, name).ravel() for p in some]) for name in ("ok", "depth"))
-        touching = np.concatenate([p.touching.ravel() for p in some])
-        rows.append(
-            {
-                "kind": kind,
-                "scenes": sum(p.ok.shape[1] for p in some),
-                "steps": len(ok),
-                "touching": int(touching.sum()),
-                "silent": int((ok & (depth > SILENT)).sum()),
-                "deepest": 1e3 * float(np.nanmax(np.where(ok, depth, np.nan), initial=-1e3)),
-                "not_ok": int((~ok).sum()),
-                "share": float((~ok).mean()),
-            }
-        )
-    columns = [
-        Column("kind", "obstacle"),
-        Column("scenes", "scenes", ",d"),
-        Column("steps", "robot-\nsteps", ",d"),
-        Column("touching", "in\ncontact", ",d"),
-        Column("silent", "silent", "d"),
-        Column("deepest", "deepest with\nok [mm]", ".4f"),
-        Column("not_ok", "not ok", "d"),
-        Column("share", "not ok", ".2%"),
-    ]
-    notes = [
-        f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms of the processor at the "
-        "median and "
-        f"{slowest:.2f} s at most ({where}).",
-        *(f"{times} x {words}" for words, times in said.most_common(8)),
-        *silent,
-    ]
-    return [Section("contact_scenes", f"Random contact scenes, seed {seed}", columns, rows, notes)]
-
-
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=10_000, help="scenes")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--first", type=int, default=0, help="batch to begin with")
-    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
-    return report.command(
-        parser, argv, lambda o: sections(TOGETHER if o.quick else o.count, o.seed, o.first, o.minutes)
+def row(kind: str, some: list[Played]) -> Row:
+    ok, depth, touching = (
+        np.concatenate([getattr(p, name).ravel() for p in some]) for name in ("ok", "depth", "touching")
     )
+    return {
+        "kind": kind,
+        "scenes": sum(p.ok.shape[1] for p in some),
+        "steps": len(ok),
+        "touching": int(touching.sum()),
+        "silent": int((ok & (depth > SILENT)).sum()),
+        "deepest": 1e3 * float(np.nanmax(np.where(ok, depth, np.nan), initial=-1e3)),
+        "not_ok": int((~ok).sum()),
+        "share": float((~ok).mean()),
+    }
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def measure(options: Any) -> list[Section]:
+    """The table by kind, and the sentences."""
+    seed, count = options.seed, TOGETHER if options.quick else options.count
+    play(make_batch(seed, options.first))  # compiled, and not timed
+    every, said, silent, end = (
+        list[Played](),
+        Counter[str](),
+        list[str](),
+        time.monotonic() + 60.0 * options.minutes,
+    )
+    taken, slowest, where = list[float](), 0.0, ""
+    for index in range(options.first, options.first - (-count // TOGETHER)):
+        if time.monotonic() > end:
+            break
+        note_progress(f"batch {index}")
+        batch = make_batch(seed, index)
+        played = play(batch)
+        every.append(played)
+        said.update(re.sub(r"-?\d[\d.e+-]*", "#", sentence) for sentence in played.sentences)
+        words = f"{batch.robot.name}, {batch.points} steps a segment, {batch.kind}"
+        silent += [
+            f"seed {seed} batch {index} scene {i} step {k}: {1e3 * played.depth[k, i]:.3f} mm, {words}"
+            for k, i in np.argwhere(played.ok & (played.depth > SILENT))
+        ]
+        taken += list(played.seconds[1:])
+        if taken and max(taken) > slowest:
+            slowest, where = float(max(taken)), f"batch {index}, {words}"
+        if not played.ok.all():
+            note_progress(f"batch {index}: not ok {np.argwhere(~played.ok).tolist()}")
+    kinds = {kind: [played for played in every if played.kind == kind] for kind in KINDS}
+    return [
+        table(
+            "contact_scenes",
+            f"Random contact scenes, seed {seed}",
+            "kind obstacle | scenes:,d | steps:,d robot-~steps | touching:,d in~contact | silent:d"
+            "| deepest:.4f deepest with~ok [mm] | not_ok:d not ok | share:.2% not ok",
+            [row(kind, some) for kind, some in (*kinds.items(), ("all", every)) if some],
+            f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms of the processor at "
+            f"the median and {slowest:.2f} s at most ({where}).",
+            *(f"{times} x {words}" for words, times in said.most_common(8)),
+            *silent,
+        )
+    ]
+
+
+main = bench(
+    __doc__,
+    measure,
+    ("--count", 10_000, "scenes"),
+    ("--seed", 1, "of all scenes"),
+    ("--first", 0, "batch to begin with"),
+    ("--minutes", np.inf, "stop after so long"),
+)

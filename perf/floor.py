@@ -7,71 +7,48 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.kernels.jit import LANES, entry, inline
+from fastrod.kernels.jit import LANES, entry
 from report import best
 
-W = LANES
-CHAINS, LINKS = 8, 16
-"""Independent sums of a lane, enough to hide the latency of an addition; multiply-adds between load and
-store."""
-
-
-@inline
-def _link(a: Any, b: Any, x: Any) -> Any:
-    y = a * x[0] + b, a * x[1] + b, a * x[2] + b, a * x[3] + b
-    return (*y, a * x[4] + b, a * x[5] + b, a * x[6] + b, a * x[7] + b)
-
-
-@inline
-def _four(a: Any, b: Any, x: Any) -> Any:
-    return _link(a, b, _link(a, b, _link(a, b, _link(a, b, x))))
-
-
-@inline
-def _over(a: Any, x: Any) -> Any:
-    return a / x[0], a / x[1], a / x[2], a / x[3], a / x[4], a / x[5], a / x[6], a / x[7]
-
-
-@inline
-def _load(y: Any, w: int) -> Any:
-    x = y[w], y[W + w], y[2 * W + w], y[3 * W + w]
-    return (*x, y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w])
-
-
-@inline
-def _store(y: Any, w: int, x: Any) -> None:
-    y[w], y[W + w], y[2 * W + w], y[3 * W + w] = x[0], x[1], x[2], x[3]
-    y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w] = x[4], x[5], x[6], x[7]
+CHAINS = 8  # independent sums of a lane, enough to hide the latency of an addition
+ADDS, DIVISIONS = 16, 2  # of a chain between load and store
 
 
 @entry
 def _multiply_add(y: Any, repeats: int) -> None:
     for _ in range(repeats):
-        for w in range(W):
-            a, b = y[8 * W + w], y[9 * W + w]
-            _store(y, w, _four(a, b, _four(a, b, _four(a, b, _four(a, b, _load(y, w))))))
+        for w in range(LANES):
+            a, b, p, q, r, s = y[8, w], y[9, w], y[0, w], y[1, w], y[2, w], y[3, w]
+            t, u, v, x = y[4, w], y[5, w], y[6, w], y[7, w]
+            for _ in range(ADDS):
+                p, q, r, s = a * p + b, a * q + b, a * r + b, a * s + b
+                t, u, v, x = a * t + b, a * u + b, a * v + b, a * x + b
+            y[0, w], y[1, w], y[2, w], y[3, w], y[4, w], y[5, w], y[6, w], y[7, w] = p, q, r, s, t, u, v, x
 
 
 @entry
 def _divide(y: Any, repeats: int) -> None:
     for _ in range(repeats):
-        for w in range(W):
-            a = y[8 * W + w]
-            _store(y, w, _over(a, _over(a, _load(y, w))))
+        for w in range(LANES):
+            a, p, q, r, s = y[8, w], y[0, w], y[1, w], y[2, w], y[3, w]
+            t, u, v, x = y[4, w], y[5, w], y[6, w], y[7, w]
+            for _ in range(DIVISIONS):
+                p, q, r, s, t, u, v, x = a / p, a / q, a / r, a / s, a / t, a / u, a / v, a / x
+            y[0, w], y[1, w], y[2, w], y[3, w], y[4, w], y[5, w], y[6, w], y[7, w] = p, q, r, s, t, u, v, x
 
 
 def fused_multiply_adds() -> float:
     """Fused multiply-adds of one number each a second, double precision, on one thread."""
-    return _rate(_multiply_add, CHAINS * LINKS)
+    return _rate(_multiply_add, CHAINS * ADDS)
 
 
 def divisions() -> float:
     """Divisions of one number each a second, double precision, on one thread."""
-    return _rate(_divide, CHAINS * 2)
+    return _rate(_divide, CHAINS * DIVISIONS)
 
 
 def _rate(run: Callable[[Any, int], None], operations: int, repeats: int = 2_000, rounds: int = 40) -> float:
     """Operations a second of a kernel that does `operations` a lane and repeat; best of `rounds`."""
-    buffer = np.full((CHAINS + 2) * W, 0.5)
+    buffer = np.full((CHAINS + 2, LANES), 0.5)
     run(buffer, 1)
-    return repeats * W * operations / best(lambda: run(buffer, repeats), rounds)
+    return repeats * LANES * operations / best(lambda: run(buffer, repeats), rounds)

@@ -1,16 +1,9 @@
-"""How much arithmetic an observer pass is.
+"""How much arithmetic an observer pass is: a process of its own, this module as a script, runs the kernels as
+plain Python, one lane wide, on numbers that count what is done with them.
 
-The count comes from the kernels themselves: a child process runs them as plain Python, one lane wide, on
-numbers that count what is done with them. Each integration step costs the same, so with N steps a segment (N
->= 2)
-
-operations(N) = operations(2) + (N - 2) (operations(3) - operations(2))
-
-is exact; tendons and columns (unknowns, and three for a moving tip force) enter through the robot whose pass
-is counted. What the compiler saves by common subexpressions is not taken off, index arithmetic is not
-counted, negation is free.
-
-Run as a script this module is that child: it reads what to count from stdin and prints the counts.
+Each integration step costs the same, so with N >= 2 steps a segment operations(N) = operations(2) + (N - 2)
+(operations(3) - operations(2)) is exact. What the compiler saves by common subexpressions is not taken off,
+index arithmetic is not counted, negation is free.
 """
 
 from __future__ import annotations
@@ -18,14 +11,14 @@ from __future__ import annotations
 import importlib
 import json
 import math
-import os
 import pkgutil
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from report import in_fresh_process
 
 
 class Tally(NamedTuple):
@@ -35,8 +28,7 @@ class Tally(NamedTuple):
     multiply: float = 0.0
     divide: float = 0.0
     root: float = 0.0
-    fused: float = 0.0
-    """Additions that take a product with them, as one fused multiply-add."""
+    fused: float = 0.0  # additions that take a product with them, as one fused multiply-add
 
     @property
     def flops(self) -> float:
@@ -54,48 +46,15 @@ class Tally(NamedTuple):
         return Tally(*(k * a for a in self))
 
 
-Parts = dict[str, Tally]
-"""Operations by kernel file."""
-
-
 class Counted(float):
     """A number that notes in `now`, by the fields of `Tally`, what is done with it."""
 
-    product = False
-    """Whether it is a product, which an addition would fuse with."""
+    product = False  # whether it is a product, which an addition would fuse with
     __array_ufunc__ = None  # a numpy number on the left leaves the operation to this class
     now = [0.0] * 5
 
-    def _done(self, operation: int, value: float, times: int = 1) -> Counted:
-        Counted.now[operation] += times
-        made = Counted(value)
-        made.product = operation == 1
-        return made
-
-    def _sum(self, other: Any, value: float) -> Counted:
-        Counted.now[4] += self.product or (isinstance(other, Counted) and other.product)
-        return self._done(0, value)
-
-    def __add__(self, other: Any) -> Counted:
-        return self._sum(other, float(self) + float(other))
-
-    def __sub__(self, other: Any) -> Counted:
-        return self._sum(other, float(self) - float(other))
-
-    def __rsub__(self, other: Any) -> Counted:
-        return self._sum(other, float(other) - float(self))
-
-    def __mul__(self, other: Any) -> Counted:
-        return self._done(1, float(self) * float(other))
-
-    def __truediv__(self, other: Any) -> Counted:
-        return self._done(2, float(self) / float(other))
-
-    def __rtruediv__(self, other: Any) -> Counted:
-        return self._done(2, float(other) / float(self))
-
     def __pow__(self, power: int) -> Counted:
-        return self._done(1, float(self) ** power, power - 1)
+        return _noted(1, float(self) ** power, power - 1)
 
     def __neg__(self) -> Counted:
         made = Counted(-float(self))
@@ -105,7 +64,28 @@ class Counted(float):
     def __abs__(self) -> Counted:
         return Counted(abs(float(self)))
 
-    __radd__, __rmul__ = __add__, __mul__
+
+def _noted(operation: int, value: float, times: int = 1) -> Counted:
+    Counted.now[operation] += times
+    made = Counted(value)
+    made.product = operation == 1
+    return made
+
+
+def _operator(name: str, operation: int) -> Callable[[Counted, Any], Counted]:
+    plain = getattr(float, name)
+
+    def run(self: Counted, other: Any) -> Counted:
+        if operation == 0:
+            Counted.now[4] += self.product or getattr(other, "product", False)
+        return _noted(operation, plain(self, float(other)))
+
+    return run
+
+
+for _operation, _names in enumerate(("add radd sub rsub", "mul rmul", "truediv rtruediv")):
+    for _name in _names.split():
+        setattr(Counted, f"__{_name}__", _operator(f"__{_name}__", _operation))
 
 
 class _Math:
@@ -113,64 +93,37 @@ class _Math:
 
     @staticmethod
     def sqrt(x: Any) -> Counted:
-        return Counted()._done(3, math.sqrt(float(x)))
+        return _noted(3, math.sqrt(float(x)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(math, name)
 
 
-def count(wanted: dict[str, int], forces: bool) -> dict[str, Parts]:
-    """Robot key -> operations of one pass with that many points per segment; `forces`: the tip force
-    moves."""
+def count(wanted: dict[str, int], forces: bool) -> dict[str, Tally]:
+    """Robot key -> operations of a pass of that many points per segment; `forces`: the tip force moves."""
     two, three = counted(list(wanted), forces, (2, 3))
-    return {
-        key: {name: two[key][name] * (3 - points) + three[key][name] * (points - 2) for name in two[key]}
-        for key, points in wanted.items()
-    }
+    return {key: two[key] * (3 - points) + three[key] * (points - 2) for key, points in wanted.items()}
 
 
-def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[dict[str, Parts]]:
+def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[dict[str, Tally]]:
     """As `count`, without the formula: for each number of points, the operations of every robot."""
-    words, environment = (
-        json.dumps([list(robots), forces, list(points)]),
-        {**os.environ, "NUMBA_DISABLE_JIT": "1"},
-    )
-    command = [sys.executable, __file__]
-    done = subprocess.run(
-        command, input=words, stdout=subprocess.PIPE, text=True, check=True, env=environment
-    )
-    return [
-        {key: {name: Tally(*tally) for name, tally in parts.items()} for key, parts in one.items()}
-        for one in json.loads(done.stdout)
-    ]
+    found = in_fresh_process(__file__, [list(robots), forces, list(points)], NUMBA_DISABLE_JIT="1")
+    return [{key: Tally(*tally) for key, tally in one.items()} for one in found]
 
 
-def _child() -> None:
-    robots, forces, points = json.load(sys.stdin)
-    sections = _instrument()
-    import cases
-
-    chosen = [case for case in cases.cases(1) if case.key in robots]
-    found = [{case.key: _counted_pass(case, n, forces, sections) for case in chosen} for n in points]
-    print(json.dumps(found))
-
-
-def _counted_pass(
-    case: Any, points: int, forces: bool, sections: dict[str, list[float]]
-) -> dict[str, list[float]]:
-    """Operations by kernel file of the third step: by then a moving force has its columns."""
+def _counted_pass(case: Any, points: int, forces: bool) -> list[float]:
+    """Operations of the third step: by then a moving force has its columns."""
     from fastrod import Simulator
 
     sim = Simulator(case.robot, 1, points_per_segment=points, outputs="tip", threads=1)
     for step in range(3):
-        for tally in sections.values():
-            tally[:] = [0.0] * 5
+        Counted.now[:] = [0.0] * 5
         sim.step(**case.inputs(case.at(step, forces)))
-    return {name: list(tally) for name, tally in sections.items() if any(tally)}
+    return list(Counted.now)
 
 
-def _instrument() -> dict[str, list[float]]:
-    """Make the kernels one lane wide and countable, and sort the counts by the file of the kernel at work."""
+def _instrument() -> None:
+    """Make the kernels one lane wide and countable."""
     from fastrod.kernels import jit
 
     jit.LANES = 1
@@ -178,21 +131,11 @@ def _instrument() -> dict[str, list[float]]:
     from fastrod.solver import boundary
     from fastrod.types import Memory, RodShape
 
-    names = [info.name for info in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
-    modules = [importlib.import_module(name) for name in names if ".contact" not in name]
-    sections = {_short(module): [0.0] * 5 for module in modules}
-    helpers = ("jit", "vec", "rod", "batch", "lanes", "workspace")
-    wrapped: dict[int, Callable[..., Any]] = {}
-    for module in (module for module in modules if _short(module) not in helpers):
-        for value in vars(module).values():
-            own = getattr(value, "__module__", "") == module.__name__
-            if own and callable(value) and not isinstance(value, type):
-                wrapped[id(value)] = _attributed(value, sections[_short(module)])
-    for module in modules:
-        held = vars(module)
-        for name, value in list(held.items()):
-            held[name] = _Math() if value is math else wrapped.get(id(value), value)
-        held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
+    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if ".contact" not in info.name:
+            held = vars(importlib.import_module(info.name))
+            held.update({name: _Math() for name, value in held.items() if value is math})
+            held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
     body = vars(boundary)["pass_serial"]
 
     def counting(*arguments: Any) -> None:
@@ -204,22 +147,6 @@ def _instrument() -> dict[str, list[float]]:
             kept[...] = new.astype(float)
 
     vars(boundary)["pass_serial"] = counting
-    return sections
-
-
-def _short(module: Any) -> str:
-    return str(module.__name__.rpartition(".")[2])
-
-
-def _attributed(function: Callable[..., Any], tally: list[float]) -> Callable[..., Any]:
-    def run(*arguments: Any) -> Any:
-        before, Counted.now = Counted.now, tally
-        try:
-            return function(*arguments)
-        finally:
-            Counted.now = before
-
-    return run
 
 
 def _countable(argument: Any) -> Any:
@@ -234,4 +161,9 @@ def _countable(argument: Any) -> Any:
 
 
 if __name__ == "__main__":
-    _child()
+    robots, forces, points = json.load(sys.stdin)
+    _instrument()
+    import cases
+
+    chosen = [case for case in cases.cases(1) if case.key in robots]
+    print(json.dumps([{case.key: _counted_pass(case, n, forces) for case in chosen} for n in points]))

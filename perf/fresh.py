@@ -1,14 +1,9 @@
-"""What only a fresh process shows: memory, and the time to start.
-
-Run as a script this module is that process: `memory N` or `start`; it prints one JSON object.
-"""
+"""What only a fresh process shows, which is this module as a script: memory, and the time to start."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,34 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from report import Row, Section, goal, note_progress, table, thread_counts
+from report import Row, Section, goal, in_fresh_process, note_progress, table, thread_counts
 
-MEMORY_TARGET = 2000.0
-"""Bytes per five-segment robot beside its inputs."""
-
-
-def _run(*words: str, **environment: str) -> dict[str, float]:
-    """What this module prints as a script."""
-    command = [sys.executable, __file__, *words]
-    found = subprocess.run(
-        command, stdout=subprocess.PIPE, text=True, check=True, env={**os.environ, **environment}
-    )
-    return dict(json.loads(found.stdout))
+MEMORY_TARGET = 2000.0  # bytes per five-segment robot beside its inputs
 
 
 def memory_section(n_robots: int) -> Section:
     note_progress("memory")
-    each = {key: value / n_robots for key, value in _run("memory", str(n_robots)).items()}
+    each = {key: value / n_robots for key, value in in_fresh_process(__file__, ["memory", n_robots]).items()}
     held, resident = each["memory"] + each["state"], each["resident"]
     rows: list[Row] = [
         {"what": "observer's memory", "bytes": each["memory"]},
         {"what": "state that a step returns", "bytes": each["state"]},
         {"what": "both, sum of nbytes", "bytes": held, **goal(held, MEMORY_TARGET)},
-        {
-            "what": "process after ten steps, beside the inputs",
-            "bytes": resident,
-            **goal(resident, MEMORY_TARGET),
-        },
+        {"what": "process after ten steps, beside the inputs", "bytes": resident}
+        | goal(resident, MEMORY_TARGET),
         {"what": "its peak in a cold start", "bytes": each["peak"]},
         {"what": "the inputs themselves", "bytes": each["inputs"]},
     ]
@@ -103,9 +85,9 @@ def start_section(quick: bool) -> Section:
     with tempfile.TemporaryDirectory() as folder:
         if not quick:
             note_progress("start with an empty cache")
-            found["empty cache"] = _run("start", FASTROD_CACHE_DIR=folder)
+            found["empty cache"] = in_fresh_process(__file__, ["start"], FASTROD_CACHE_DIR=folder)
         environment = {} if quick else {"FASTROD_CACHE_DIR": folder}
-        again = [_run("start", **environment) for _ in range(1 if quick else 4)]
+        again = [in_fresh_process(__file__, ["start"], **environment) for _ in range(1 if quick else 4)]
     found["cached"] = {key: min(run[key] for run in again) for key in named}
     rows = [
         {"cache": cache, "what": what, "seconds": times[key], "threads": str(threads)}
@@ -141,4 +123,5 @@ def _start() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(_memory(int(sys.argv[2])) if sys.argv[1] == "memory" else _start()))
+    name, *given = json.load(sys.stdin)
+    print(json.dumps({"memory": _memory, "start": _start}[name](*given)))

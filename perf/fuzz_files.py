@@ -1,7 +1,4 @@
-"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it; a table of
-the outcomes.
-
-python perf/fuzz_files.py --count 20000 --seed 1
+"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it.
 
 File number k is the same for the same seed (`tests/fuzz/fuzz_seeds.py` makes it). It is read right, or
 refused in one sentence with exit code 2; anything else is counted in a column of its own and listed by
@@ -10,7 +7,6 @@ number, which `--only K` reads again. Exit code 1 where any file was neither.
 
 from __future__ import annotations
 
-import argparse
 import math
 import multiprocessing
 import sys
@@ -91,8 +87,7 @@ class Worker:
 
 
 def run(indices: Sequence[int], seed: int, workers: int) -> Iterator[Outcome]:
-    """Outcomes of these files, as they come, from so many processes; one that is stuck or dies is counted,
-    and another goes on."""
+    """Outcomes as they come, from so many processes; one that is stuck or dies is counted and replaced."""
     every = [Worker(list(indices[k::workers]), seed) for k in range(workers) if indices[k::workers]]
     while live := {worker.ends: worker for worker in every if worker.todo}:
         for ready in wait(list(live), timeout=1.0):
@@ -116,7 +111,7 @@ def figures(outcomes: Sequence[Outcome]) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     outcomes, count = [], 2 * len(KINDS) if options.quick else options.count
     for outcome in run(options.only or range(count), options.seed, options.workers):
         outcomes.append(outcome)
@@ -141,5 +136,3 @@ main = bench(
     ("--workers", 2, "processes"),
     ("--only", (int,), "these files alone, by number, each with what was said"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,5 +1,4 @@
-"""fastrod on the rod of Appendix J: `settle` from the straight rod, and single passes along a path of
-loads."""
+"""fastrod on the rod of Appendix J: `settle` from the straight rod, and single passes from load to load."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""MuJoCo on the rod of Appendix J: its own rods (1D flexcomp), and chains of bodies with springs in ball
-joints and hinges."""
+"""MuJoCo on the rod of Appendix J: its own rods (1D flexcomp), and chains of bodies with springs."""
 
 from __future__ import annotations
 
@@ -28,11 +27,9 @@ class Setting:
     rest."""
 
     links: int
-    dt: float
-    """[s]; the first mode has 8.7 rad/s."""
+    dt: float  # s; the first mode has 8.7 rad/s
     steps: int
-    damping: float = 0.0
-    """Of stiffness [s] (Rayleigh)."""
+    damping: float = 0.0  # s, of stiffness (Rayleigh)
 
     def __str__(self) -> str:
         return f"{self.links} links, {self.steps} steps of {self.dt:g} s"
@@ -45,42 +42,34 @@ def model(kind: Kind, setting: Setting) -> mujoco.MjModel:
     body = _flex(setting) if kind == "flex" else _chain(kind, setting)
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><compiler angle="radian"/><option timestep="{setting.dt}" integrator="discrete" '
-        'gravity="0 0 0">'
-        f'<flag contact="disable"/></option><worldbody>{body}</worldbody></mujoco>'
+        f'gravity="0 0 0"><flag contact="disable"/></option><worldbody>{body}</worldbody></mujoco>'
     )
 
 
 def _flex(setting: Setting) -> str:
     """A clamped edge half behind the wall, so that the clamp is at the wall for a curvature that lives at the
     vertices."""
-    n = setting.links
-    h = LENGTH / (n - 0.5)
-    second = 0.25 * math.pi * _RADIUS**4
+    n, h, second = setting.links, LENGTH / (setting.links - 0.5), 0.25 * math.pi * _RADIUS**4
     return (
         f'<flexcomp name="rod" type="grid" dim="1" count="{n + 1} 1 1" spacing="{h} 1 1" '
-        f'pos="{0.5 * n * h - 0.5 * h} 0 0" '
-        f'radius="{_RADIUS}" mass="{_MASS}"><pin id="0 1"/><edge equality="true" solref="1e-4 1" '
-        'solimp="0.9999 0.9999 0.001"/>'
-        f'<elasticity young="{BENDING / second}" '
-        f'shear="{TORSION / (2.0 * second)}" damping="{setting.damping}"/>'
-        '<contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp>'
+        f'pos="{0.5 * n * h - 0.5 * h} 0 0" radius="{_RADIUS}" mass="{_MASS}"><pin id="0 1"/>'
+        '<edge equality="true" solref="1e-4 1" solimp="0.9999 0.9999 0.001"/>'
+        f'<elasticity young="{BENDING / second}" shear="{TORSION / (2.0 * second)}" '
+        f'damping="{setting.damping}"/><contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp>'
     )
 
 
 def _chain(kind: Kind, setting: Setting) -> str:
     """Half a link clamped, whole links, half a link; a spring EI/h in each joint."""
-    n = setting.links
-    h = LENGTH / n
+    n, h = setting.links, LENGTH / setting.links
     spring = BENDING / h
     joint = f'<joint type="{kind}" axis="0 0 1" stiffness="{spring}" damping="{setting.damping * spring}"/>'
     body, at = "", 0.5 * h
-    for i in range(n):
-        link = h if i + 1 < n else 0.5 * h
+    for link in [h] * (n - 1) + [0.5 * h]:
         mass = _MASS * link / LENGTH
-        inertia = mass * h * h / 12.0
+        inertia = " ".join([str(mass * h * h / 12.0)] * 3)
         body += (
-            f'<body pos="{at} 0 0">{joint}<inertial pos="{link} 0 0" mass="{mass}" '
-            f'diaginertia="{inertia} {inertia} {inertia}"/>'
+            f'<body pos="{at} 0 0">{joint}<inertial pos="{link} 0 0" mass="{mass}" diaginertia="{inertia}"/>'
         )
         at = link
     return body + "</body>" * n
@@ -138,41 +127,39 @@ _FLEX = ((3, 0.2, 8, 0.1), (6, 0.2, 8, 0.1), (8, 0.2, 10, 0.1), (12, 0.1, 16, 0.
 _LONG = ((24, 0.03, 45, 0.2), (32, 0.02, 70, 0.2))
 
 
-def _rungs(kind: Kind) -> list[Rung]:
-    most = {"ball": 64, "hinge": 128}.get(kind, 0)
+def _peer(name: str, kind: Kind, most: int, same: str) -> Peer:
     links = [Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64, 128) if n <= most]
-    return [
-        Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one))
-        for one in links or [Setting(*words) for words in (*_FLEX, *_LONG)]
-    ]
+    return Peer(
+        name=f"MuJoCo {name}",
+        modules=("mujoco",),
+        same=same,
+        also="dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and "
+        "Warp, inverse dynamics.",
+        rungs=[
+            Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one))
+            for one in links or [Setting(*words) for words in (*_FLEX, *_LONG)]
+        ],
+    )
 
 
-_ALSO = (
-    "dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and Warp, "
-    "inverse dynamics."
-)
-FLEX = Peer(
-    name="MuJoCo rod (flexcomp)",
-    modules=("mujoco",),
-    same="a discrete elastic rod with EI and GJ as they are, begun half an edge before the wall; its edges "
+FLEX = _peer(
+    "rod (flexcomp)",
+    "flex",
+    0,
+    "a discrete elastic rod with EI and GJ as they are, begun half an edge before the wall; its edges "
     "are held by constraints that give a little, the less the shorter the step; brought to rest by long "
     "implicit steps (integrator discrete).",
-    also=_ALSO,
-    rungs=_rungs("flex"),
 )
-BALLS = Peer(
-    name="MuJoCo chain, ball joints",
-    modules=("mujoco",),
-    same="links with a spring EI/h in each ball joint, half a link at both ends. Twist gets EI too, for a "
+BALLS = _peer(
+    "chain, ball joints",
+    "ball",
+    64,
+    "links with a spring EI/h in each ball joint, half a link at both ends. Twist gets EI too, for a "
     "ball has one stiffness: it is not loaded here.",
-    also=_ALSO,
-    rungs=_rungs("ball"),
 )
-HINGES = Peer(
-    name="MuJoCo chain, hinges",
-    modules=("mujoco",),
-    same="the same chain with hinges across the plane of the load: a plane rod, and the plane is given to "
-    "it.",
-    also=_ALSO,
-    rungs=_rungs("hinge"),
+HINGES = _peer(
+    "chain, hinges",
+    "hinge",
+    128,
+    "the same chain with hinges across the plane of the load: a plane rod, and the plane is given to it.",
 )

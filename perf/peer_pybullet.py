@@ -1,9 +1,9 @@
-"""PyBullet on the rod of Appendix J: a chain of rigid links with springs in its hinges, in two layouts.
+"""PyBullet on the rod of Appendix J: a chain of rigid links with springs EI N/l in its hinges, in two
+layouts.
 
-*Equal links* is the beam of SoMo's documentation (Graule et al., SoMo, IROS 2021; "Calibration to
-Hardware"): N links of l/N, each hinged at its near end, the first at the wall. *Half end links* is what
-SoMo's URDF writer makes of a plane manipulator: half a link fixed to the wall, N - 1 whole ones, half a
-link. The spring is EI/(l/N).
+*Equal links* is the beam of SoMo's documentation (Graule et al., SoMo, IROS 2021; "Calibration to Hardware"):
+N links of l/N, each hinged at its near end, the first at the wall. *Half end links* is what SoMo's URDF
+writer makes of a plane manipulator: half a link fixed to the wall, N - 1 whole ones, half a link.
 """
 
 from __future__ import annotations
@@ -80,25 +80,26 @@ def _chain(links: int, half_ends: bool, patience: float = 1.0) -> Iterator[Solve
         bullet.disconnect()
 
 
-def _rungs(half_ends: bool) -> list[Rung]:
-    return [Rung(f"{n} links", partial(_chain, n, half_ends)) for n in (2, 4, 8, 16)]
+def _peer(name: str, half_ends: bool, same: str) -> Peer:
+    return Peer(
+        name=f"PyBullet chain, {name}",
+        modules=("pybullet",),
+        same=same,
+        also="dynamics, its own contact with friction between all bodies, any other robot in the same world.",
+        rungs=[Rung(f"{n} links", partial(_chain, n, half_ends)) for n in (2, 4, 8, 16)],
+    )
 
 
-_ALSO = "dynamics, its own contact with friction between all bodies, any other robot in the same world."
-EQUAL = Peer(
-    name="PyBullet chain, equal links",
-    modules=("pybullet",),
-    same="the layout of SoMo's documentation, springs EI N/l by torques; a plane chain in units of the rod's "
-    "own, critically damped. The calibration there (the first link's chord) would make every spring twice as "
+EQUAL = _peer(
+    "equal links",
+    False,
+    "the layout of SoMo's documentation, springs EI N/l by torques; a plane chain in units of the rod's own, "
+    "critically damped. The calibration there (the first link's chord) would make every spring twice as "
     "stiff for many links.",
-    also=_ALSO,
-    rungs=_rungs(False),
 )
-HALVES = Peer(
-    name="PyBullet chain, half end links",
-    modules=("pybullet",),
-    same="the same with half a link fixed to the wall and half a link at the tip, as SoMo's URDF writer has "
-    "it for a plane manipulator.",
-    also=_ALSO,
-    rungs=_rungs(True),
+HALVES = _peer(
+    "half end links",
+    True,
+    "the same with half a link fixed to the wall and half a link at the tip, as SoMo's URDF writer has it "
+    "for a plane manipulator.",
 )

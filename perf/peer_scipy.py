@@ -1,5 +1,4 @@
-"""scipy on the rod of Appendix J: shooting with the lean slope of `scipy_rod`, and collocation by
-`solve_bvp`."""
+"""scipy on the rod of Appendix J: shooting with the lean slope of `scipy_rod`, and collocation."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""soromox on the rod of Appendix J: piecewise constant and geometric variable strain in JAX, with bending
-alone left free.
+"""soromox on the rod of Appendix J: piecewise constant and geometric variable strain in JAX, bending alone
+free.
 
 It has dynamics, forces and Jacobians, but no solver for rest: that is Newton's method on its stiffness
 matrix and its forward kinematics, differentiated and compiled by JAX as one would write it.
@@ -44,8 +44,7 @@ def _pcs(segments: int) -> tuple[Any, int, Callable[[Any], Any]]:
 
 
 def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
-    """One segment whose curvature in the plane is a Legendre series of this order, over so many Gauss
-    points."""
+    """One segment, its curvature in the plane a Legendre series of this order, over so many Gauss points."""
     import jax.numpy as jnp
     from soromox.systems.components import JointSpec
     from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
@@ -94,21 +93,25 @@ def _rung(label: str, make: Callable[[], tuple[Any, int, Callable[[Any], Any]]])
     return Rung(label, partial(_newton, make, False), partial(_newton, make, True))
 
 
-_ALSO = (
-    "dynamics, shear and stretch by choice of strains, derivatives of everything by JAX, GPU, controllers."
+def _peer(name: str, same: str, rungs: Sequence[Rung]) -> Peer:
+    return Peer(
+        name=f"soromox {name}",
+        modules=("soromox", "jax"),
+        same=same,
+        also="dynamics, shear and stretch by choice of strains, derivatives of everything by JAX, GPU, "
+        "controllers.",
+        rungs=rungs,
+    )
+
+
+PCS = _peer(
+    "PCS",
+    "constant curvature a segment, plane, shear and stretch left out by its own choice of strains.",
+    [_rung(f"{n} segment{'s' * (n > 1)}", partial(_pcs, n)) for n in (1, 4, 16)],
 )
-PCS = Peer(
-    name="soromox PCS",
-    modules=("soromox", "jax"),
-    same="constant curvature a segment, plane, shear and stretch left out by its own choice of strains.",
-    also=_ALSO,
-    rungs=[_rung(f"{n} segment{'s' * (n > 1)}", partial(_pcs, n)) for n in (1, 4, 16)],
-)
-GVS = Peer(
-    name="soromox GVS",
-    modules=("soromox", "jax"),
-    same="one segment in space, its curvature in the plane a Legendre series, every other strain left out.",
-    also=_ALSO,
+GVS = _peer(
+    "GVS",
+    "one segment in space, its curvature in the plane a Legendre series, every other strain left out.",
     # 5 points are its least; each setting takes long to build and to compile
-    rungs=[_rung(f"order {n}, {m} points", partial(_gvs, n, m)) for n, m in ((0, 5), (1, 6), (3, 12))],
+    [_rung(f"order {n}, {m} points", partial(_gvs, n, m)) for n, m in ((0, 5), (1, 6), (3, 12))],
 )

@@ -1,5 +1,4 @@
-"""The one runner of the benchmarks: takes times, prints tables for people and the same rows as JSON for
-programs.
+"""The one runner of the benchmarks: takes times, prints tables for people and the same rows as JSON.
 
 A benchmark is a file `bench_NAME.py` with `main = report.bench(__doc__, measure, ...)`; `measure` returns
 tables.
@@ -14,12 +13,13 @@ import math
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
@@ -30,8 +30,7 @@ Row = dict[str, Value]
 _WIDTH = 166  # characters of the widest table; a narrower terminal wraps its lines but loses nothing
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One column of a table: its key in a row, its heading, and the format of its values."""
 
     key: str
@@ -40,10 +39,7 @@ class Column:
 
 
 def columns(text: str) -> list[Column]:
-    """Columns written as `key:format heading`, one after the other between bars; `~` breaks a heading's line.
-
-    A column without a heading is headed by its key.
-    """
+    """Columns written as `key:format heading` between bars; `~` breaks a heading's line."""
     found = []
     for one in text.split("|"):
         name, _, head = one.strip().partition(" ")
@@ -61,29 +57,28 @@ class Section:
     columns: Sequence[Column]
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
-    failed: bool = False
-    """Whether this table is a check, and something in it is not as it must be: the exit code is then 1."""
+    failed: bool = False  # a check in which something is not as it must be: the exit code is then 1
 
-    def as_json(self) -> Mapping[str, object]:
+    def as_json(self) -> dict[str, object]:
+        """As JSON knows it, which knows neither nan nor infinity."""
         meaning = {column.key: column.head.replace("\n", " ") for column in self.columns}
-        rows = [{key: _plain(value) for key, value in row.items()} for row in self.rows]
+        rows = [
+            {key: None if isinstance(x, float) and not math.isfinite(x) else x for key, x in row.items()}
+            for row in self.rows
+        ]
         return {"title": self.title, "columns": meaning, "rows": rows, "notes": self.notes}
 
 
 def table(key: str, title: str, text: str, rows: Iterable[Row], *notes: str, failed: bool = False) -> Section:
-    """A table whose columns are written as in `columns`."""
-    return Section(key, title, columns(text), list(rows), list(notes), failed)
+    """A table whose columns are written as in `columns`; numbers of numpy become Python's."""
+    plain = [{name: x.item() if hasattr(x, "item") else x for name, x in row.items()} for row in rows]
+    return Section(key, title, columns(text), plain, list(notes), failed)
 
 
 def goal(value: float, target: float, *, least: bool = False, name: str = "") -> Row:
     """A target beside its figure, and whether it is met: at most `target`, or at `least` that much."""
     met = value >= target if least else value <= target
     return {f"{name}target": target, f"{name}met": bool(met)}
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows neither nan nor infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def show(sections: Sequence[Section], head: str) -> None:
@@ -129,14 +124,11 @@ def machine() -> dict[str, str]:
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
     model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
-    versions = (
-        f"Python {platform.python_version()}, numpy {numpy.__version__}, numba {numba.__version__}, "
-        f"scipy {scipy.__version__}"
-    )
+    libraries = ", ".join(f"{one.__name__} {one.__version__}" for one in (numpy, numba, scipy))
     return {
         "cpu": model or platform.processor() or platform.machine(),
         "cores": str(numba.config.NUMBA_NUM_THREADS),
-        "versions": versions,
+        "versions": f"Python {platform.python_version()}, {libraries}",
     }
 
 
@@ -154,7 +146,7 @@ class Measurement:
         self.clock, self.times = clock, list[float]()
 
     def take(self, run: Callable[[], Any]) -> Any:
-        """Call once, without the collector of garbage; what the call returned."""
+        """What one call returns, timed without the collector of garbage."""
         gc.disable()
         try:
             start = self.clock()
@@ -166,7 +158,6 @@ class Measurement:
 
     @property
     def least(self) -> float:
-        """What the machine can do when nothing else wants it; nan before the first call."""
         return min(self.times, default=math.nan)
 
     @property
@@ -188,16 +179,25 @@ def alternate(runs: Sequence[Callable[[], Any]], rounds: int) -> list[Measuremen
     return found
 
 
-def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:
-    """Time of one call [s], and what it returned."""
-    measurement = Measurement(clock)
-    result = measurement.take(run)
-    return measurement.least, result
+def seconds(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Wall time of one call [s], and what it returned."""
+    taken = Measurement()
+    result = taken.take(run)
+    return taken.least, result
 
 
 def best(run: Callable[[], object], repeats: int) -> float:
     """Least wall time of several calls [s]."""
     return alternate([run], repeats)[0].least
+
+
+def in_fresh_process(file: str, given: Any, **environment: str) -> Any:
+    """What a script prints as JSON, given this as JSON on its standard input."""
+    env, words = {**os.environ, **environment}, json.dumps(given)
+    done = subprocess.run(
+        [sys.executable, file], input=words, stdout=subprocess.PIPE, text=True, check=True, env=env
+    )
+    return json.loads(done.stdout)
 
 
 Option = tuple[str, Any, str]
@@ -208,12 +208,14 @@ help."""
 def bench(
     doc: str | None, measure: Callable[[argparse.Namespace], Sequence[Section]], *options: Option
 ) -> Callable[[Sequence[str] | None], int]:
-    """The `main` of a benchmark, with `--json`, `--quick` and these options."""
+    """The `main` of a benchmark, with `--json`, `--quick` and these options; where `measure` is of the script
+    that runs, its exit."""
 
     def main(argv: Sequence[str] | None = None) -> int:
         form = argparse.RawDescriptionHelpFormatter
         parser = argparse.ArgumentParser(description=doc, formatter_class=form)
-        for name, default, words in options:
+        common = ("--json", False, "print one JSON object and nothing else"), ("--quick", False, _QUICK)
+        for name, default, words in (*options, *common):
             if default is False:
                 parser.add_argument(name, action="store_true", help=words)
             elif isinstance(default, list):
@@ -225,22 +227,20 @@ def bench(
             else:
                 words += " (default: %(default)s)"
                 parser.add_argument(name, type=type(default), default=default, help=words)
-        return command(parser, argv, measure)
+        return _run(measure, parser.parse_args(argv))
 
+    if measure.__module__ == "__main__":
+        sys.exit(main())
     return main
 
 
-def command(
-    parser: argparse.ArgumentParser,
-    argv: Sequence[str] | None,
-    measure: Callable[[argparse.Namespace], Sequence[Section]],
-) -> int:
-    """Read a benchmark's command line, measure and print; the exit code."""
+_QUICK = "little of everything: figures mean little"
+
+
+def _run(measure: Callable[[argparse.Namespace], Sequence[Section]], options: argparse.Namespace) -> int:
+    """Measure and print; the exit code."""
     from fastrod.errors import FastrodError
 
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="little of everything: figures mean little")
-    options = parser.parse_args(argv)
     # other work on the machine spoils figures, of two threads first
     start, load = time.perf_counter(), os.getloadavg()[0]
     try:
@@ -248,13 +248,8 @@ def command(
     except FastrodError as error:
         print(error, file=sys.stderr)
         return 2
-    head = {
-        **machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
+    head = {**machine(), "load_before": f"{load:.2f}", "load_after": f"{os.getloadavg()[0]:.2f}"}
+    head |= {"seconds": f"{time.perf_counter() - start:.0f}", "quick": str(options.quick).lower()}
     if options.json:
         made = {section.key: section.as_json() for section in measured}
         print(json.dumps({"machine": head, "sections": made}))

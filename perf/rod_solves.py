@@ -15,8 +15,7 @@ from fastrod import Simulator, State
 from report import Measurement, Row, Section, goal, note_progress, table, thread_counts
 from scipy_rod import Points, Run, Shooter, follow
 
-GOAL = 1e-4
-"""A full solve is one to this: a boundary residual [m], or more strictly the tip error [m]."""
+GOAL = 1e-4  # m, a full solve is one to this boundary residual, or more strictly tip error
 TARGET_RATIO = {"paper": 5000.0, "full": 1500.0}
 RESIDUAL_TARGET = 5e-5
 
@@ -29,8 +28,7 @@ class Path:
     case: Case
     fine: Simulator
     truth: State
-    points: int
-    """The fewest points per segment that keep `cases.TIP_ERROR` at every point."""
+    points: int  # the fewest points per segment that keep `cases.TIP_ERROR` at every point
     error: TipError
 
     def at(self, index: Any) -> tuple[dict[str, Any], Array]:
@@ -50,8 +48,7 @@ class Solved(NamedTuple):
     """Warm solves of a batch whose robots stand at all points of the path."""
 
     tolerance: float
-    seconds: list[float]
-    """Of one solve of the whole batch, on one and on several threads [s]."""
+    seconds: list[float]  # of one solve of the whole batch, on one and on several threads [s]
     passes: float
     error: TipError
 
@@ -76,8 +73,7 @@ def batch(path: Path, n_robots: int, tolerance: float, steps: int) -> Solved:
 
 
 def batches(path: Path, n_robots: int, steps: int) -> list[Solved]:
-    """With a residual tolerance of `GOAL`, and where that leaves the tip farther off, the loosest that
-    brings it within."""
+    """To a residual of `GOAL`; where the tip is still farther off, also to the loosest that suffices."""
     found = [batch(path, n_robots, GOAL, steps)]
     for fraction in (0.5, 0.2, 0.1, 0.05):
         if found[-1].error.largest <= GOAL:
@@ -126,28 +122,19 @@ def solve_section(paths: Sequence[Path], n_robots: int, quick: bool) -> Section:
         note_progress(f"full solve, {path.model}")
         for solved in batches(path, n_robots, 3 if quick else 8):
             own = [t / n_robots for t in solved.seconds]
-            rows.append(
-                {
-                    "model": path.model,
-                    "solver": "fastrod",
-                    "how": f"{solved.tolerance:.0e}",
-                    "points": path.points,
-                }
-                | {"us_one": 1e6 * own[0], "us_many": 1e6 * own[1], "passes": solved.passes}
-                | {"error_max_m": solved.error.largest, "error_median_m": solved.error.median}
-                | {"ok": solved.error.compared, "integration_error_max_m": path.error.largest}
-            )
+            row: Row = {"model": path.model, "solver": "fastrod", "how": f"{solved.tolerance:.0e}"}
+            row |= {"points": path.points, "us_one": 1e6 * own[0], "us_many": 1e6 * own[1]}
+            row |= {"passes": solved.passes, "error_max_m": solved.error.largest, "ok": solved.error.compared}
+            row |= {"error_median_m": solved.error.median, "integration_error_max_m": path.error.largest}
+            rows.append(row)
         for peer, run in _scipy(path, stretches(path, 2 if quick else 8)):
             stop = f" {peer.stop:.0e}" if peer.stop else ""
             ratios, target = [run.cpu_s / t for t in own], TARGET_RATIO[path.model]
-            rows.append(
-                {"model": path.model, "solver": f"scipy, {peer.slope}"}
-                | {"how": f"{peer.rtol:.0e} {peer.atol:.0e}{stop}", "us_one": 1e6 * run.cpu_s}
-                | {"passes": run.passes, "error_max_m": float(run.error_m.max())}
-                | {"error_median_m": float(np.median(run.error_m)), "ratio_one": ratios[0]}
-                | {"ratio_many": ratios[1], "target": target}
-                | {"met": " / ".join("yes" if ratio >= target else "no" for ratio in ratios)}
-            )
+            row = {"model": path.model, "solver": f"scipy, {peer.slope}", "us_one": 1e6 * run.cpu_s}
+            row |= {"how": f"{peer.rtol:.0e} {peer.atol:.0e}{stop}", "passes": run.passes, "target": target}
+            row |= {"error_max_m": run.error_m.max(), "error_median_m": np.median(run.error_m)}
+            row |= {"ratio_one": ratios[0], "ratio_many": ratios[1]}
+            rows.append(row | {"met": " / ".join("yes" if r >= target else "no" for r in ratios)})
     return table(
         "full_solve",
         "Full solve to 1e-4 m from the solution before",
@@ -165,8 +152,8 @@ def solve_section(paths: Sequence[Path], n_robots: int, quick: bool) -> Section:
         "thread. arrays: the slope as one writes it with numpy, scipy's default tolerances. scalars, "
         "compiled: the slope in plain scalars, and that compiled by numba; the loosest of several tolerances "
         "that bring every tip within 1e-4 m, and the search ends at the residual `stop`.",
-        "Ratio: scipy's time over fastrod's in the last fastrod row of the model, both with every tip within "
-        "1e-4 m. The targets were set with a scipy solve of about 25 ms in mind.",
+        "Ratio: to the last fastrod row of the model. The targets were set with a scipy solve of 25 ms in "
+        "mind.",
     )
 
 
@@ -186,14 +173,10 @@ def path_section(paths: Sequence[Path], steps: int) -> Section:
                 errors.append(np.linalg.norm(state.tip_position - truth, axis=1)[state.ok])
                 lost += int((~state.ok).sum())
         residual, error = np.concatenate(residuals), np.concatenate(errors)
-        median = float(np.median(residual))
-        rows.append(
-            {"model": path.model, "points": path.points, "residual_median_m": median}
-            | goal(median, RESIDUAL_TARGET)
-            | {"residual_99_m": float(np.quantile(residual, 0.99)), "residual_max_m": float(residual.max())}
-            | {"error_median_m": float(np.median(error)), "error_max_m": float(error.max())}
-            | {"lost": lost / (lost + len(residual))}
-        )
+        row: Row = {"model": path.model, "points": path.points, "lost": lost / (lost + len(residual))}
+        row |= {"residual_median_m": np.median(residual), **goal(np.median(residual), RESIDUAL_TARGET)}
+        row |= {"residual_99_m": np.quantile(residual, 0.99), "residual_max_m": residual.max()}
+        rows.append(row | {"error_median_m": np.median(error), "error_max_m": error.max()})
     return table(
         "path",
         "The 500 points with one pass a step",
@@ -202,7 +185,6 @@ def path_section(paths: Sequence[Path], steps: int) -> Section:
         "| error_median_m:.1e tip error~median [m] | error_max_m:.1e tip error~max [m] | lost:.2% steps "
         "not~ok",
         rows,
-        "One `step` a point, lengths and tip force both moving; residual: of the boundary that the step "
-        "predicted, before it corrects it. The paper reports 5e-4 m. Any number of threads gives the same "
-        "numbers.",
+        "Lengths and tip force both moving. The paper reports a residual of 5e-4 m. Any number of threads "
+        "gives the same numbers.",
     )

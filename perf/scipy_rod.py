@@ -20,8 +20,7 @@ from cases import Array
 from fastrod import Robot
 from report import Measurement
 
-Tendons: TypeAlias = tuple[tuple[float, float, float], ...]
-"""Position d_x, d_y [m] and tension [N] of each."""
+Tendons: TypeAlias = tuple[tuple[float, float, float], ...]  # position d_x, d_y [m] and tension [N] of each
 Points: TypeAlias = Sequence[tuple[Array, Sequence[float], Array]]
 """Tendon lengths (4,) [m], tip force and line force (6) [N, N/m], true tip (3,) [m]."""
 N_TENDONS = 4
@@ -104,8 +103,7 @@ def compiled_slope() -> Callable[..., Any]:
 
 @dataclass
 class Shooter:
-    """One robot of one segment and four tendons, solved by shooting with scipy; warm after the first
-    solve."""
+    """One robot of one segment and four tendons, shooting with scipy; warm after the first solve."""
 
     robot: Robot
     slope: Literal["arrays", "scalars", "compiled"]
@@ -113,11 +111,9 @@ class Shooter:
     rtol: float = 1e-3
     atol: float = 1e-6
     """Of lengths [m]; of the rotation's entries this over the length, of curvature over its square."""
-    ftol: float = 1e-8
-    """Where the search ends, ftol and xtol of least_squares."""
+    ftol: float = 1e-8  # where the search ends, ftol and xtol of least_squares
     stop: float = 0.0
-    """Largest boundary residual at which the search ends at once [m]; 0: only where least_squares itself
-    ends."""
+    """Largest boundary residual at which the search ends at once [m]; 0: where least_squares ends."""
 
     def __post_init__(self) -> None:
         (segment,) = self.robot.segments
@@ -133,7 +129,7 @@ class Shooter:
         self.x = np.zeros(len(self.unit))
         self.passes = 0
 
-    def right_hand_side(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
+    def slope_of(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
         """f(s, y) as `solve_ivp` wants it."""
         rod = self.rod
         if self.slope == "arrays":
@@ -161,7 +157,7 @@ class Shooter:
 
         self.passes += 1
         state, tendons = self.start(x)
-        slope, tolerances = self.right_hand_side(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
+        slope, tolerances = self.slope_of(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
         found: Any = solve_ivp(slope, (0.0, self.rod[0]), state, method=self.integrator, **tolerances)
         return np.asarray(found.y[:, -1])
 
@@ -222,15 +218,13 @@ class _EnoughError(Exception):
 class Run(NamedTuple):
     """What a shooter took over stretches of points."""
 
-    cpu_s: float
-    """CPU time of one solve, mean over the points, best of the rounds [s]."""
+    cpu_s: float  # CPU time of one solve, mean over the points, best of the rounds [s]
     passes: float
     error_m: Array
 
 
 def follow(peer: Shooter, stretches: Sequence[tuple[Array, Points]], rounds: int) -> Run:
-    """Solve the points of each stretch one after the other, warm from its first unknowns, `rounds` times
-    over."""
+    """Solve the points of each stretch in turn, warm from its first unknowns, `rounds` times over."""
     n_points = sum(len(points) for _, points in stretches)
     means = []
     for _ in range(rounds):

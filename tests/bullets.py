@@ -1,23 +1,21 @@
 """Worlds and robots that the tests of hosts share."""
 
 import numpy as np
+from rods import rod
 
+from fastrod.contact import ContactScene
 from fastrod.hosts import BulletLink, connect
-from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot
+from fastrod.simulator import Simulator
+
+HALF = np.sqrt(0.5)
+ROTATION = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}
+"""Of the base with the rod along a world axis, w x y z."""
 
 
-def soft_robot(n_segments=2, line_density=0.0, extension=(0.0, 0.0)):
-    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
-    segment = Segment(
-        length=0.1,
-        bending_stiffness=(0.0022, 0.0022),
-        torsional_stiffness=0.001,
-        body_radius=0.012,
-        line_density=line_density,
-        extension=extension,
-        tendons=tendons,
-    )
-    return Robot(name="soft", segments=(segment,) * n_segments)
+def soft_robot(n_segments=2, **segment):
+    own = rod(length=0.1, body_radius=0.012, **segment).segments[0]
+    return Robot(name="soft", segments=(own,) * n_segments)
 
 
 def empty_world(dt=0.005, gravity=0.0):
@@ -43,9 +41,7 @@ def kuka(world, seed):
 def carrier(world, axis="z"):
     """A body without mass or shape that is moved by hand, and the base on it with the rod along this world
     axis."""
-    half = np.sqrt(0.5)
-    angle = {"z": (1.0, 0.0, 0.0, 0.0), "x": (half, 0.0, half, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}[axis]
-    return BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.0] * 3), quaternion=angle)
+    return BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.0] * 3), quaternion=ROTATION[axis])
 
 
 def move(link, position, velocity):
@@ -58,3 +54,17 @@ def cube(world, size, mass, position, friction=0.5):
     body = world.createMultiBody(mass, shape, -1, list(position))
     world.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0, lateralFriction=friction)
     return body
+
+
+def clearance_of(contact):
+    """How far a thin rod beside a body of one shape is from it, and both ends of the rod (2, 3): the least
+    distance of the whole rod is at most theirs."""
+    robot, name = soft_robot(1), contact.names[0]
+    scene = ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0)
+    sim = Simulator(robot, contact=scene)
+    where = {
+        "base_pose": (0.15, 0.1, 0.12, 1, 0, 0, 0),
+        "obstacle_pose": {name: contact.expected([])[0][name]},
+    }
+    state = sim.settle(robot.rest_tendon_length, **where)
+    return sim.clearance()[0], state.position[0, [0, -1]]

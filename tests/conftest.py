@@ -49,15 +49,7 @@ def one_compilation() -> Iterator[None]:
     from fastrod.kernels import batch
     from fastrod.kernels.rod import cold
 
-    big = (
-        "pass_serial",
-        "pass_parallel",
-        "iterate_serial",
-        "iterate_parallel",
-        "search_serial",
-        "search_parallel",
-        "move_to_inputs",
-    )
-    counts = {name: len(getattr(batch, name).signatures) for name in big}
+    big = [f"{what}_{how}" for what in ("pass", "iterate", "search") for how in ("serial", "parallel")]
+    counts = {name: len(getattr(batch, name).signatures) for name in (*big, "move_to_inputs")}
     counts["begin"] = len(cold.begin.signatures)
     assert {name: n for name, n in counts.items() if n > 1} == {}

@@ -73,9 +73,8 @@ def log(
 def camera(angle: float, distance: float, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A rotation by `angle` [rad] about a random axis, a shift by `distance` [m] in a random direction."""
     axis, way = np.random.default_rng(seed).normal(size=(2, 3))
-    return Rotation.from_rotvec(
-        angle * axis / np.linalg.norm(axis)
-    ).as_matrix(), distance * way / np.linalg.norm(way)
+    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    return rotation.as_matrix(), distance * way / np.linalg.norm(way)
 
 
 def csv(run: Run) -> str:
@@ -86,8 +85,7 @@ def csv(run: Run) -> str:
 
 
 def _routing() -> np.ndarray:
-    """(6, 4) change of tendon length per bend about x and y of each segment: a tendon on the inner side is
-    shorter."""
+    """(6, 4) change of tendon length per bend about x and y of each segment: shorter on the inner side."""
     one = OFFSET * np.stack([np.sin(ANGLES), -np.cos(ANGLES)], axis=1)
     made = np.zeros((6, 4))
     made[:, :2], made[3:, 2:] = one, one[3:]

@@ -15,20 +15,14 @@ from fastrod.model.robotfile import dumps
 
 def small(count: int = 600, shard_rows: int = 50, seed: int = 3, **words: Any) -> Plan:
     """Shapes of the prototype in tiny shards."""
-    return Plan(
-        work=Shapes(robot=dumps(fastrod.load_robot("prototype")), **words),
-        count=count,
-        shard_rows=shard_rows,
-        seed=seed,
-    )
+    work = Shapes(robot=dumps(fastrod.load_robot("prototype")), **words)
+    return Plan(work=work, count=count, shard_rows=shard_rows, seed=seed)
 
 
 def bits(folder: Path) -> dict[str, str]:
     """Digest of each file in the folder of shards, hidden ones too; none where there is no such folder."""
-    return {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted((folder / "shards").glob("*"))
-    }
+    paths = sorted((folder / "shards").glob("*"))
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
 def rows_of(folder: Path, column: str = "row") -> list[int]:

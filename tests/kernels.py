@@ -1,5 +1,4 @@
-"""Compile the large kernels into the cache, two processes at a time: a free rod on one thread and on two,
-then a rod in contact."""
+"""Compile the large kernels into the cache, two processes at a time: a free rod, then a rod in contact."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything
-else."""
+"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything."""
 
-from __future__ import annotations
-
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -20,6 +18,9 @@ from websockets.typing import Subprotocol
 
 from fastrod_viewer.app import App
 
+DRIVE = [sys.executable, "-m", "fastrod.commands.cli", "drive", "--emulate", "--seed", "3"]
+DRIVE += ["--no-home", "--no-open", "--port", "0"]
+"""The command that drives the emulated prototype and prints the address of its page."""
 CAMERA = _messages.ViewerCameraMessage(
     wxyz=(1.0, 0.0, 0.0, 0.0),
     position=(1.0, 0.0, 0.0),

@@ -20,9 +20,8 @@ def backlash_log() -> RunLog:
     robot = load_robot("prototype")
     t = np.arange(420) / 15.0
     size = np.interp(t, [0.0, 3.0, 28.0], [0.0, 0.8, 0.25])
-    bend = np.stack(
-        [size * np.sin(2.0 * np.pi * t / 4.2), 0.5 * size * np.cos(2.0 * np.pi * t / 6.7)], axis=1
-    )
+    x, y = size * np.sin(2.0 * np.pi * t / 4.2), 0.5 * size * np.cos(2.0 * np.pi * t / 6.7)
+    bend = np.stack([x, y], axis=1)
     bend[:45] = 0.0
     dl = route(robot).tendon_change(bend[:, None])
     felt, at = np.empty_like(dl), dl[0]

@@ -31,10 +31,8 @@ def rod(
     **segment: object,
 ) -> Robot:
     """One segment like the paper's robot, with what a test wants different."""
-    tendons = tuple(
-        Tendon(offset=offset, angle=2.0 * np.pi * i / n_tendons, compliance=compliance)
-        for i in range(0 if mode == "passive" else n_tendons)
-    )
+    angles = () if mode == "passive" else (2.0 * np.pi * i / n_tendons for i in range(n_tendons))
+    tendons = tuple(Tendon(offset=offset, angle=angle, compliance=compliance) for angle in angles)
     given = {"length": 0.07, "bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001} | segment
     return Robot(name=mode, segments=(Segment(mode=mode, tendons=tendons, **given),))
 

@@ -26,6 +26,14 @@ HEADER = "t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n"
 LOG = HEADER + "0,a,0,0,0,0,0,0,0.07\n0.1,a,0,0,0,0,0.001,0,0.07\n0,b,0,0,0,0,0,0,0.07\n"
 
 
+Captured, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
+
+
+def fastrod(line: str) -> int:
+    """The exit code of the command with these words."""
+    return cli.main(line.split())
+
+
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     path = tmp_path / "log.csv"
@@ -34,9 +42,8 @@ def log(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def straight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulator whose robots stay straight, so that the words of the command line are tested without the
-    model."""
+def straight(monkeypatch: Patch) -> None:
+    """A simulator whose robots stay straight: the words are tested without the model."""
 
     class Straight:
         def __init__(self, robot: Robot, n_robots: int) -> None:
@@ -48,9 +55,9 @@ def straight(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fastrod.simulator", SimpleNamespace(Simulator=Straight))
 
 
-def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+def refused(capsys: Captured, line: str) -> str:
     """The sentence on stderr of a command line that must exit with 2 and print nothing else."""
-    assert cli.main(argv) == 2
+    assert fastrod(line) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1, err
@@ -60,82 +67,66 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_prints_the_table_and_names_its_files(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, capsys: Captured) -> None:
     out = tmp_path / "out"
-    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(out)]) == 0
+    assert fastrod(f"replay {log} --robot prototype --out {out}") == 0
     printed, err = capsys.readouterr()
-    assert "excursion" in printed
-    assert str(out / "residuals.csv") in printed
-    assert str(out / "replay.png") in printed
+    for word in ("excursion", str(out / "residuals.csv"), str(out / "replay.png")):
+        assert word in printed
     assert err == ""
     assert sorted(path.name for path in out.iterdir()) == ["replay.png", "residuals.csv"]
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_of_one_run_into_the_default_folder(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replay_of_one_run_into_the_default_folder(log: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["replay", str(log), "--robot", "prototype", "--run", "b"]) == 0
+    assert fastrod(f"replay {log} --robot prototype --run b") == 0
     assert len((tmp_path / "log_replay" / "residuals.csv").read_text().splitlines()) == 2
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_knows_a_measured_set_by_its_header(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_replay_knows_a_measured_set_by_its_header(tmp_path: Path, capsys: Captured) -> None:
     path = tmp_path / "raw.csv"
     path.write_text(
         "row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump\n"
         "0,0,0,0.1,-43,-144,276,0,0\n1,0,4,0,-42,-136,305,0,0\n"
     )
-    assert cli.main(["replay", str(path), "--out", str(tmp_path / "out")]) == 0
+    assert fastrod(f"replay {path} --out {tmp_path / 'out'}") == 0
     assert "armlab_tdcr" in capsys.readouterr().out
-    assert "robot 'prototype' has 4 tendons, the one of raw.csv has 3" in refused(
-        capsys, "replay", str(path), "--robot", "prototype"
-    )
+    sentence = refused(capsys, f"replay {path} --robot prototype")
+    assert "robot 'prototype' has 4 tendons, the one of raw.csv has 3" in sentence
 
 
 @pytest.mark.usefixtures("straight")
 def test_replay_that_converges_nowhere_has_failed(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    log: Path, tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
     def settle(self: Any, **given: Any) -> SimpleNamespace:
         return SimpleNamespace(tip_position=self.tip, ok=np.zeros(len(self.tip), dtype=bool))
 
     monkeypatch.setattr(sys.modules["fastrod.simulator"].Simulator, "settle", settle)
-    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
+    assert fastrod(f"replay {log} --robot prototype --out {tmp_path / 'out'}") == 1
     assert capsys.readouterr().err == "the model converged on none of the 3 rows.\n"
 
 
 @pytest.mark.usefixtures("straight")
+@pytest.mark.parametrize("command", ["replay LOG --robot prototype", "demo"])
+@pytest.mark.parametrize(("below", "why"), [("", "it is a file"), ("/below", "Not a directory")])
 def test_folder_that_cannot_be_written_is_refused_before_the_work(
-    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    log: Path, monkeypatch: Patch, capsys: Captured, command: str, below: str, why: str
 ) -> None:
-    def work(*args: Any, **given: Any) -> None:
-        raise AssertionError("the work began")
-
-    monkeypatch.setattr("fastrod.identification.log.replay.replay", work)
-    monkeypatch.setattr("fastrod.commands.demo._batch", work)
-    for command in (("replay", str(log), "--robot", "prototype"), ("demo",)):
-        assert refused(capsys, *command, "--out", str(log)) == (
-            f"folder {str(log)!r} cannot be written: it is a file.\n"
-        )
-        below = log / "below"
-        assert refused(capsys, *command, "--out", str(below)) == (
-            f"folder {str(below)!r} cannot be written: Not a directory.\n"
-        )
+    for work in ("fastrod.identification.log.replay.replay", "fastrod.commands.demo._batch"):
+        monkeypatch.setattr(work, lambda *args, **given: pytest.fail("the work began"))
+    sentence = refused(capsys, f"{command} --out {log}{below}".replace("LOG", str(log)))
+    assert sentence == f"folder '{log}{below}' cannot be written: {why}.\n"
 
 
 @pytest.mark.usefixtures("straight")
-def test_file_that_cannot_be_written_has_failed(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "out" / "residuals.csv.part").mkdir(parents=True)
-    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
-    assert capsys.readouterr().err == f"{tmp_path / 'out' / 'residuals.csv.part'}: Is a directory.\n"
+def test_file_that_cannot_be_written_has_failed(log: Path, tmp_path: Path, capsys: Captured) -> None:
+    taken = tmp_path / "out" / "residuals.csv.part"
+    taken.mkdir(parents=True)
+    assert fastrod(f"replay {log} --robot prototype --out {taken.parent}") == 1
+    assert capsys.readouterr().err == f"{taken}: Is a directory.\n"
 
 
 @pytest.fixture(scope="module")
@@ -147,58 +138,26 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_identify_prints_the_verdict_and_names_its_files(
-    measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    measured: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     out = tmp_path / "out"
     # A log behind --held-out is a log all the same.
-    words = [
-        "identify",
-        "--robot",
-        "prototype",
-        "--max-effects",
-        "1",
-        "--out",
-        str(out),
-        "--held-out",
-        "two",
-        str(measured),
-    ]
-    assert cli.main(words) == 0
+    line = f"identify --robot prototype --max-effects 1 --out {out} --held-out two {measured}"
+    assert fastrod(line) == 0
     printed, err = capsys.readouterr()
     assert err == ""
-    for word in (
-        "backlash",
-        "half width",
-        "noise floor",
-        "held out",
-        str(out / "report.html"),
-        str(out / "identified.toml"),
-    ):
+    for word in ("backlash", "half width", "noise floor", "held out", f"{out}/report.html"):
         assert word in printed
+    assert str(out / "identified.toml") in printed
     assert json.loads((out / "report.json").read_text())["held_out"] == ["two"]
 
 
 def test_identify_json_prints_json_and_nothing_else(
-    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    measured: Path, tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert (
-        cli.main(
-            [
-                "identify",
-                str(measured),
-                "--robot",
-                "prototype",
-                "--held-out",
-                "two",
-                "three@8:",
-                "--max-effects",
-                "0",
-                "--json",
-            ]
-        )
-        == 0
-    )
+    line = f"identify {measured} --robot prototype --held-out two three@8: --max-effects 0 --json"
+    assert fastrod(line) == 0
     printed, err = capsys.readouterr()
     assert json.loads(printed)["held_out"] == ["two", "three@8:"]
     assert err == ""
@@ -206,7 +165,7 @@ def test_identify_json_prints_json_and_nothing_else(
 
 
 def test_identify_takes_several_logs_and_the_default_folder(
-    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    measured: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     seen: dict[str, Any] = {}
 
@@ -218,37 +177,17 @@ def test_identify_takes_several_logs_and_the_default_folder(
     monkeypatch.chdir(tmp_path)
     other = tmp_path / "other.csv"
     other.write_bytes(measured.read_bytes())
-    assert (
-        cli.main(
-            [
-                "identify",
-                str(measured),
-                "--robot",
-                "prototype",
-                str(other),
-                "--free-camera",
-                "--max-effects",
-                "2",
-            ]
-        )
-        == 2
-    )
+    assert fastrod(f"identify {measured} --robot prototype {other} --free-camera --max-effects 2") == 2
     assert seen["names"] == ["small", "other"]
-    assert (seen["held_out"], seen["max_effects"], seen["free_camera"], seen["progress"]) == (
-        [],
-        2,
-        True,
-        None,
-    )
+    given = [seen[name] for name in ("held_out", "max_effects", "free_camera", "progress")]
+    assert given == [[], 2, True, None]
     assert seen["folder"]  # made before the long work, and gone where nothing came of it
     assert not (tmp_path / "small_identified").exists()
 
 
-def test_excite_writes_a_run_to_be_driven(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_excite_writes_a_run_to_be_driven(tmp_path: Path, monkeypatch: Patch, capsys: Captured) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["excite", "--robot", "prototype", "--bend", "0.5", "--rate", "10"]) == 0
+    assert fastrod("excite --robot prototype --bend 0.5 --rate 10") == 0
     assert "step and hold" in capsys.readouterr().out
     path = tmp_path / "prototype_excitation.csv"
     assert path.read_text().startswith("# Inputs of a run that separates effects")
@@ -258,80 +197,54 @@ def test_excite_writes_a_run_to_be_driven(
     assert log.t[1] == pytest.approx(0.1)
 
 
-def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_that_of_the_package(capsys: Captured) -> None:
     with pytest.raises(SystemExit) as end:
-        cli.main(["--version"])
+        fastrod("--version")
     assert not end.value.code
     assert capsys.readouterr().out == f"fastrod {version('fastrod')}\n"
 
 
+MISSING = "the following arguments are required: "
+NOT_SAID = "log.csv is a run log and does not say whose; name its robot with --robot."
+IDENTIFY = "identify LOG --robot prototype "
 WRONG = {
-    "no command": ([], "the following arguments are required: COMMAND"),
-    "unknown command": (["repaly"], "no command 'repaly'; did you mean 'replay'?"),
-    "unknown option": (["demo", "--speed"], "fastrod demo does not know '--speed'"),
-    "no log": (["replay"], "the following arguments are required: LOG"),
+    "no command": ("", MISSING + "COMMAND"),
+    "unknown command": ("repaly", "no command 'repaly'; did you mean 'replay'?"),
+    "unknown option": ("demo --speed", "fastrod demo does not know '--speed'"),
+    "no log": ("replay", MISSING + "LOG"),
     "log not there": (
-        ["replay", "none.csv", "--robot", "prototype"],
+        "replay none.csv --robot prototype",
         "log 'none.csv' cannot be read: No such file or directory.",
     ),
-    "unknown robot": (
-        ["replay", "LOG", "--robot", "prototpye"],
-        "no robot 'prototpye'; did you mean 'prototype'?",
-    ),
-    "no robot": (
-        ["replay", "LOG"],
-        "log.csv is a run log and does not say whose; name its robot with --robot.",
-    ),
-    "unknown run": (
-        ["replay", "LOG", "--robot", "prototype", "--run", "c"],
-        "no run 'c' in log 'log'; known: a, b.",
-    ),
+    "unknown robot": ("replay LOG --robot prototpye", "no robot 'prototpye'; did you mean 'prototype'?"),
+    "no robot": ("replay LOG", NOT_SAID),
+    "unknown run": ("replay LOG --robot prototype --run c", "no run 'c' in log 'log'; known: a, b."),
     "other robot": (
-        ["replay", "LOG", "--robot", "tdcr_a"],
+        "replay LOG --robot tdcr_a",
         "has 4 dl_ columns (dl_1 to dl_4); robot 'tdcr_a' has 6 tendons",
     ),
-    "identify: no log": (["identify", "--robot", "prototype"], "the following arguments are required: LOG"),
-    "identify: no robot": (
-        ["identify", "LOG"],
-        "log.csv is a run log and does not say whose; name its robot with --robot.",
-    ),
-    "identify: unknown option": (
-        ["identify", "LOG", "--robot", "prototype", "--jsn"],
-        "fastrod identify does not know '--jsn'",
-    ),
-    "identify: short log": (
-        ["identify", "LOG", "--robot", "prototype", "--json"],
-        "has 3 measured rows; identification needs 40",
-    ),
-    "identify: the same log twice": (
-        ["identify", "LOG", "LOG", "--robot", "prototype", "--json"],
-        "two logs are named 'log'",
-    ),
-    "identify: effects": (
-        ["identify", "LOG", "--robot", "prototype", "--json", "--max-effects", "-1"],
-        "max_effects is -1",
-    ),
-    "identify: folder": (
-        ["identify", "LOG", "--robot", "prototype", "--out", "LOG"],
-        "cannot be written: it is a file.",
-    ),
-    "excite: no robot": (["excite"], "the following arguments are required: --robot"),
-    "excite: bend": (["excite", "--robot", "prototype", "--bend", "50"], "Was it given in degrees?"),
-    "excite: text": (["excite", "--robot", "prototype", "--rate", "fast"], "invalid float value: 'fast'"),
+    "identify: no log": ("identify --robot prototype", MISSING + "LOG"),
+    "identify: no robot": ("identify LOG", NOT_SAID),
+    "identify: unknown option": (IDENTIFY + "--jsn", "fastrod identify does not know '--jsn'"),
+    "identify: short log": (IDENTIFY + "--json", "has 3 measured rows; identification needs 40"),
+    "identify: the same log twice": ("identify LOG LOG --robot prototype --json", "two logs are named 'log'"),
+    "identify: effects": (IDENTIFY + "--json --max-effects -1", "max_effects is -1"),
+    "identify: folder": (IDENTIFY + "--out LOG", "cannot be written: it is a file."),
+    "excite: no robot": ("excite", MISSING + "--robot"),
+    "excite: bend": ("excite --robot prototype --bend 50", "Was it given in degrees?"),
+    "excite: text": ("excite --robot prototype --rate fast", "invalid float value: 'fast'"),
     "excite: suffix": (
-        ["excite", "--robot", "prototype", "--out", "run.txt"],
+        "excite --robot prototype --out run.txt",
         "'run.txt' does not end in .csv or .parquet",
     ),
-    "bench option": (["bench", "--jsno"], "fastrod bench does not know '--jsno'"),
+    "bench option": ("bench --jsno", "fastrod bench does not know '--jsno'"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_one_sentence_and_code_2(
-    log: Path, capsys: pytest.CaptureFixture[str], case: str
-) -> None:
-    argv, sentence = WRONG[case]
-    assert sentence in refused(capsys, *(str(log) if word == "LOG" else word for word in argv))
+def test_wrong_input_is_one_sentence_and_code_2(log: Path, capsys: Captured, case: str) -> None:
+    line, sentence = WRONG[case]
+    assert sentence in refused(capsys, line.replace("LOG", str(log)))
 
 
 BAD_CELLS = {
@@ -347,77 +260,64 @@ BAD_CELLS = {
 
 
 @pytest.mark.parametrize("case", BAD_CELLS)
-def test_bad_log_is_one_sentence_and_code_2(log: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+def test_bad_log_is_one_sentence_and_code_2(log: Path, capsys: Captured, case: str) -> None:
     text, sentence = BAD_CELLS[case]
     log.write_text(text)
-    assert sentence in refused(capsys, "replay", str(log), "--robot", "prototype")
+    assert sentence in refused(capsys, f"replay {log} --robot prototype")
 
 
-def test_bad_robot_file_is_one_sentence_and_code_2(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_of_a_log_without_runs(log: Path, capsys: Captured) -> None:
+    log.write_text("t,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n0,0,0,0,0,0,0,0.07\n")
+    sentence = refused(capsys, f"replay {log} --robot prototype --run zz")
+    assert sentence == "no run 'zz'; log 'log' names no runs.\n"
+
+
+def test_bad_robot_file_is_one_sentence_and_code_2(log: Path, tmp_path: Path, capsys: Captured) -> None:
     robot = tmp_path / "robot.toml"
     robot.write_text('name = "x"\n[[segmnt]]\n')
-    assert "did you mean 'segment'?" in refused(capsys, "replay", str(log), "--robot", str(robot))
+    assert "did you mean 'segment'?" in refused(capsys, f"replay {log} --robot {robot}")
 
 
-def test_bench_runs_the_scripts_of_perf(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bench_runs_the_scripts_of_perf(tmp_path: Path, monkeypatch: Patch, capsys: Captured) -> None:
     for name, figure in (("step", 1), ("settle", 2)):
-        text = (
-            f"def main(argv):\n    print('{{\"ratio\": {figure}}}' if argv == ['--json'] else 'ratio "
-            f"{figure}')\n    return 0\n"
-        )
-        (tmp_path / f"bench_{name}.py").write_text(text)
+        printed = f"'{{\"ratio\": {figure}}}' if argv == ['--json'] else 'ratio {figure}'"
+        (tmp_path / f"bench_{name}.py").write_text(f"def main(argv):\n    print({printed})\n    return 0\n")
     monkeypatch.setattr(cli, "_PERF", tmp_path)
-    assert cli.main(["bench", "step"]) == 0
+    assert fastrod("bench step") == 0
     assert capsys.readouterr().out == "ratio 1\n"
-    assert cli.main(["bench", "--json"]) == 0
+    assert fastrod("bench --json") == 0
     assert json.loads(capsys.readouterr().out) == {"settle": {"ratio": 2}, "step": {"ratio": 1}}
-    assert "no benchmark 'stepp'; did you mean 'step'?" in refused(capsys, "bench", "stepp")
+    assert "no benchmark 'stepp'; did you mean 'step'?" in refused(capsys, "bench stepp")
     monkeypatch.setattr(cli, "_PERF", tmp_path / "absent")
     assert "fastrod bench needs the source checkout" in refused(capsys, "bench")
     (tmp_path / "pyproject.toml").touch()
     assert f"no benchmarks are in {str(tmp_path / 'absent')!r}" in refused(capsys, "bench")
 
 
-def test_run_of_a_log_without_runs(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log.write_text("t,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n0,0,0,0,0,0,0,0.07\n")
-    sentence = refused(capsys, "replay", str(log), "--robot", "prototype", "--run", "zz")
-    assert sentence == "no run 'zz'; log 'log' names no runs.\n"
-
-
-def test_help_has_every_command_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_has_every_command_once(capsys: Captured) -> None:
     from fastrod.commands.arguments import build
 
     with pytest.raises(SystemExit) as end:
-        cli.main(["--help"])
+        fastrod("--help")
     assert not end.value.code
     said = capsys.readouterr().out
     parser, names = build()
-    lines = [line.split()[0] for line in said.partition("examples:")[0].splitlines() if line.startswith("  ")]
-    assert sorted(lines) == sorted(names)
+    commands, _, examples = (
+        [line.strip() for line in half.splitlines() if line.startswith("  ")]
+        for half in said.partition("examples:")
+    )
+    assert sorted(line.split()[0] for line in commands) == sorted(names)
     assert max(map(len, said.splitlines())) <= 120
-    for example in [
-        line.strip().split("  ")[0]
-        for line in said.partition("examples:")[2].splitlines()
-        if line.startswith("  ")
-    ]:
-        assert parser.parse_known_args(example.split()[1:])[1] == []
+    for example in examples:
+        assert parser.parse_known_args(example.split("  ")[0].split()[1:])[1] == []
 
 
 def test_help_does_not_load_numba() -> None:
     code = (
-        "import sys; from fastrod.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit as "
-        "end: assert not end.code\n"
+        "import sys; from fastrod.commands.cli import main\ntry: main(['--help'])\n"
+        "except SystemExit as end: assert not end.code\nassert 'numba' not in sys.modules"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code + "assert 'numba' not in sys.modules"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "replay" in done.stdout
 
@@ -431,7 +331,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The whole demo, once: its folder and what it printed."""
     out, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
     with contextlib.redirect_stdout(printed):
-        assert cli.main(["demo", "--seed", str(SEED), "--no-view", "--out", str(out)]) == 0
+        assert fastrod(f"demo --seed {SEED} --no-view --out {out}") == 0
     return out, printed.getvalue()
 
 
@@ -456,15 +356,10 @@ def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:
         assert f"wrote {out / name}" in printed
     found = load_robot(out / "identified.toml")
     named = [effect["name"] for effect in json.loads((out / "report.json").read_text())["effects"]]
-    # beside them the zeros of the wires, which homing does not know better than it says
+    # beside them the zeros of the tendons, which homing does not know better than it says
     assert {table["name"] for table in found.effects} == {*named, "encoder_offset"}
-    runs = sorted(path.stem for path in out.glob("*.csv"))
-    assert runs == sorted(
-        [
-            "excite",
-            *(f"{path}_{when}" for path in ("triangle", "square", "circle") for when in ("before", "after")),
-        ]
-    )
+    driven = {f"{path}_{when}" for path in ("triangle", "square", "circle") for when in ("before", "after")}
+    assert sorted(path.stem for path in out.glob("*.csv")) == sorted(driven | {"excite"})
     assert not list(out.glob("*.part"))
     assert read_log(out / "excite.csv", found).measured.mean() > 0.98
 
@@ -484,20 +379,26 @@ def test_tracking_is_nearer_to_the_path_with_what_was_found(demo: tuple[Path, st
 
 
 def test_demo_refuses_a_folder_that_is_not_empty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
     monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: pytest.fail("the work began"))
     (tmp_path / "mine.csv").write_text("t\n")
-    assert "is not empty" in refused(capsys, "demo", "--out", str(tmp_path))
+    assert "is not empty" in refused(capsys, f"demo --out {tmp_path}")
     assert (tmp_path / "mine.csv").read_text() == "t\n"
 
 
-def test_demo_without_the_device_wing_names_what_was_sealed_into_its_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def no_device(monkeypatch: Patch) -> None:
+    """The demo without the device wing, and without its batch."""
     monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: None)
     monkeypatch.setattr("fastrod.commands.demo.find_spec", lambda name: None)
-    assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.usefixtures("no_device")
+def test_demo_without_the_device_wing_names_what_was_sealed_into_its_log(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    assert fastrod(f"demo --out {tmp_path / 'out'}") == 0
     printed, err = capsys.readouterr()
     assert err == ""
     made = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -508,22 +409,17 @@ def test_demo_without_the_device_wing_names_what_was_sealed_into_its_log(
     assert f"wrote {tmp_path / 'out' / 'report.html'}" in printed
 
 
+@pytest.mark.usefixtures("no_device")
 def test_demo_without_the_device_wing_takes_the_shipped_log_and_writes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
     """The words around the work; the work on that log is above."""
     seen: list[int] = []
-
-    def stand_in(log: Any, robot: Robot) -> Any:
-        seen.append(len(log))
-        return "a result"
-
-    monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: None)
-    monkeypatch.setattr("fastrod.commands.demo.find_spec", lambda name: None)
-    monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
+    identify = "fastrod.identification.attribution.identify"
+    monkeypatch.setattr(identify, lambda log, robot: seen.append(len(log)) or "a result")
     monkeypatch.setattr("fastrod.identification.report.report.table", str)
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["demo"]) == 0
+    assert fastrod("demo") == 0
     printed = capsys.readouterr().out
     assert "a result" in printed
     assert "pip install 'fastrod[device,viewer]'" in printed

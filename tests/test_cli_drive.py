@@ -117,19 +117,19 @@ def test_nothing_is_written_over(run: Run, tmp_path: Path) -> None:
 def test_calibrate_finds_the_hidden_lens(run: Run, tmp_path: Path) -> None:
     code, out, err = run("calibrate", "--emulate", "--seed", "3", "--views", "12")
     assert (code, err) == (0, "")
-    told = rows(out)
-    assert set(told) == {"fx, px", "fy, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2", "k3"}
+    reported = rows(out)
+    assert set(reported) == {"fx, px", "fy, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2", "k3"}
     for name in ("fx, px", "fy, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2"):
-        found, stderr, _, true = told[name]
+        found, stderr, _, true = reported[name]
         assert off(found, true, stderr) < 4.0
     # the file's are those of another lens
-    assert off(told["fx, px"][2], told["fx, px"][3], told["fx, px"][1]) > 3.0
-    assert off(told["k1"][2], told["k1"][3], told["k1"][1]) > 8.0
+    assert off(reported["fx, px"][2], reported["fx, px"][3], reported["fx, px"][1]) > 3.0
+    assert off(reported["k1"][2], reported["k1"][3], reported["k1"][1]) > 8.0
     assert "12 views used, reprojection error 0." in out
     assert "not at rest" in out
     assert 'camera = "camera.toml"' in out
     camera = load_camera(tmp_path / "camera.toml")
-    assert camera.matrix[0][0] == pytest.approx(told["fx, px"][0], abs=0.006)
+    assert camera.matrix[0][0] == pytest.approx(reported["fx, px"][0], abs=0.006)
     # all but the lens stays
     assert replace(camera, matrix=CAMERA.matrix, distortion=CAMERA.distortion) == CAMERA
     # and the line that it says does it
@@ -146,19 +146,19 @@ def test_calibrate_finds_the_hidden_lens(run: Run, tmp_path: Path) -> None:
 def test_register_finds_the_hidden_place(run: Run, tmp_path: Path) -> None:
     code, out, err = run("register", "--emulate", "--seed", "4", "--views", "16")
     assert (code, err) == (0, "")
-    told = rows(out)
-    assert list(told) == [
+    reported = rows(out)
+    assert list(reported) == [
         "x, mm",
         "y, mm",
         "z, mm",
         *(f"turned about the camera's {axis}, deg" for axis in "xyz"),
     ]
-    for found, stderr, _, true in told.values():
+    for found, stderr, _, true in reported.values():
         assert off(found, true, stderr) < 4.0
-    assert max(off(file, true, stderr) for _, stderr, file, true in told.values()) > 10.0
+    assert max(off(file, true, stderr) for _, stderr, file, true in reported.values()) > 10.0
     assert "16 views used" in out
     camera = load_camera(tmp_path / "camera_placed.toml")
-    assert 1e3 * camera.position[2] == pytest.approx(told["z, mm"][0], abs=6e-4)
+    assert 1e3 * camera.position[2] == pytest.approx(reported["z, mm"][0], abs=6e-4)
     assert replace(camera, position=CAMERA.position, quaternion=CAMERA.quaternion) == CAMERA
 
 
@@ -224,9 +224,9 @@ def test_pictures_that_are_collected_differ() -> None:
     assert still.passed["like one that was taken"] > 5
     assert boards.collect(eye, board, 3, clock, apart=0.0, patience=1.0).passed == {"not at rest": 1}
     eye.wave()
-    told: list[int] = []
-    waved = boards.collect(eye, board, 4, clock, progress=lambda _, done, total: told.append(done))
-    assert told == [1, 2, 3, 4]
+    reported: list[int] = []
+    waved = boards.collect(eye, board, 4, clock, progress=lambda _, done, total: reported.append(done))
+    assert reported == [1, 2, 3, 4]
     assert waved.passed["not at rest"] > 4
     with pytest.raises(
         CalibrationError,

@@ -1,5 +1,4 @@
-"""Ports beside lengths and loads: an effect on tensions, on pretension and on the base is what a user would
-give."""
+"""Ports beside lengths and loads: an effect on them is what a user would give."""
 
 from __future__ import annotations
 
@@ -138,9 +137,8 @@ def test_a_mount_that_gives_is_a_base_that_moves() -> None:
     first = soft.settle(lengths, tip_force=force)
     same(first, plain.settle(lengths, tip_force=force))  # before it was pulled at, it gives nothing
     wrench = first.base_wrench[0]
-    pose = np.concatenate(
-        [1e-3 * wrench[:3], product(quaternion_from_vector(0.5 * wrench[3:]), np.eye(4)[0])]
-    )
+    rotated = product(quaternion_from_vector(0.5 * wrench[3:]), np.eye(4)[0])
+    pose = np.concatenate([1e-3 * wrench[:3], rotated])
     then = soft.settle(lengths, tip_force=force)
     same(then, plain.settle(lengths, tip_force=force, base_pose=pose), 1e-12)
     assert_allclose(then.position[0, 0], pose[:3], atol=1e-15)

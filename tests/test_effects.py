@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from fastrod.effects.base import (
     Operator,
     Parameter,
     Seam,
+    Static,
     columns,
     effect,
     effect_names,
@@ -66,8 +67,8 @@ def one_segment() -> Robot:
 def two_segments() -> Robot:
     """Antagonistic wires, those of the far segment at places of their own in the near one."""
     (near,) = one_segment().segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
-    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
+    routed = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
+    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=routed)
     return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1))
 
 
@@ -261,7 +262,7 @@ def changes_tendons(robot: Robot, **inputs: Any) -> bool:
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     ports = Reader(layout, params, rest, 1).ports(Inputs(**inputs))
     pipeline = EffectPipeline([robot], 1)
-    _, changed = pipeline.act(ports, params, None, DT, N_STEPS, np.zeros(1, bool))
+    _, changed, _ = pipeline.act(ports, params, None, DT, N_STEPS, np.zeros(1, bool))
     return not all(
         np.array_equal(getattr(changed, name), getattr(params, name)) for name in ("offset", "compliance")
     )
@@ -311,10 +312,10 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
-    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no
+    """What a sweep leaves behind: numbers in every column that a tendon, a bend or a past step has, and no
     column beside the memory."""
-    wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
-    assert {*wires, "latency", "plastic_set"} <= set(OPERATORS)
+    columns_of = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
+    assert {*columns_of, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()
     wiring, n = route(robot), robot.n_tendons
     dl = 0.002 * np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (1, 20, n)), axis=1)
@@ -332,7 +333,7 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
             assert memory.shape[1] == 1 + BUFFER * (1 + n)
             used = 1 + 20 * (1 + n)
         else:
-            width = wires.get(name, memory.shape[1] // n) * n  # of others, whole columns for each wire
+            width = columns_of.get(name, memory.shape[1] // n) * n  # of others, whole columns for each tendon
             used = 2 * robot.n_segments if name == "plastic_set" else width
             assert memory.shape[1] == (2 * n if name == "plastic_set" else used)
         assert np.isfinite(memory[0, :used]).all()
@@ -340,12 +341,12 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
 
 
 def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
-    """More segments than wires: a passive one, then one with two wires. What no wire commands keeps no set,
-    and nothing is written beside the memory."""
+    """More segments than tendons: a passive one, then one with two tendons. What no tendon commands keeps no
+    set, and nothing is written beside the memory."""
     (near,) = one_segment().segments
     chain = (replace(near, mode="passive", tendons=()),) * 2 + (replace(near, tendons=near.tendons[:2]),)
     robot = having(
-        Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
+        Robot(name="few tendons", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
     )
     wiring = route(robot)
     what: Any = get_effect("plastic_set")
@@ -385,7 +386,8 @@ def test_the_jacobian_is_by_what_is_commanded(tables: list[Table]) -> None:
     assert sim.settle(**base, tolerance=1e-13).ok.all()
     jacobian = sim.jacobian()[0]
     columns = [("tendon_length", i, 1e-6, 1e-6) for i in range(8)]
-    # wires that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that `jacobian`
+    # tendons that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that
+    # `jacobian`
     # takes is then too
     # long by its square; twice what is left
     columns += [("extension", k, 1e-6, 5e-6) for k in range(2)]
@@ -644,6 +646,115 @@ def test_unregister_takes_a_synonym_too() -> None:
         with pytest.raises(UnknownNameError):
             get_effect(name)
     assert "gear_play" not in registry._SYNONYMS
+
+
+class Poke(Static):
+    """Something leans on the backbone, written by a user.
+
+    Equation: F at arclength a
+    Source: cantilever with a load within its span
+    Residual signature: a bend that no tendon asks for
+    """
+
+    frame: ClassVar[Any] = "world"
+    seam = Seam.LOAD
+    parameters = (
+        Parameter("force", "N", typical=0.05),
+        Parameter("arclength", "m", bounds=(0.0, 1.0), typical=0.03, shape=True),
+    )
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        ports.add_point_force(values[:, 1], values[:, :1] * np.array([0.0, 1.0, 0.0]), self.frame)
+
+
+Lean = type("Lean", (Poke,), {"__doc__": Poke.__doc__, "__module__": __name__, "frame": "material"})
+
+
+def poked(robot: Robot, force: float, arclength: float, name: str = "poke") -> Robot:
+    """The robot under a force of Poke, or of Lean."""
+    effect({"poke": Poke, "lean": Lean}[name])
+    return having(robot, {"name": name, "force": force, "arclength": arclength})
+
+
+@pytest.mark.usefixtures("clean_registry")
+@pytest.mark.parametrize("name", ["poke", "lean"])
+def test_a_point_force_of_an_effect_bends_a_cantilever_as_the_closed_form_says(name: str) -> None:
+    """Half way: P l^3 / 24 EI there, 5 P l^3 / 48 EI at the tip."""
+    load, length = 1e-3, 0.07  # P l^2 / EI; what the closed form leaves out is its square, 1e-6
+    sim = Simulator(poked(rod("passive"), load * 0.0022 / length**2, 0.5 * length, name))
+    state = sim.settle(tolerance=1e-13)
+    assert_allclose(state.tip_position[0, 1], 5.0 / 48.0 * load * length, rtol=1e-5)
+    assert_allclose(sim.shape(0.5 * length).position[0, 0, 1], load * length / 24.0, rtol=1e-5)
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_point_force_of_an_effect_is_one_that_is_given() -> None:
+    lengths, near, far = bend(rod(), 0.5, -0.3), (0.031, (0.0, 0.1, 0.0)), (0.05, (0.02, 0.0, -0.03))
+    one, two = Simulator(poked(rod(), 0.1, 0.031), n_robots=2), Simulator(rod(), n_robots=2)
+    for given in ({}, {"line_force": np.outer(np.arange(4), [0.1, 0.3, 0.0])[None]}):
+        here = one.settle(lengths, point_force=[far], tolerance=1e-13, **given)
+        there = two.settle(lengths, point_force=[far, near], tolerance=1e-13, **given)
+        assert_allclose(here.position, there.position, rtol=0.0, atol=1e-12)
+        assert_allclose(here.tension, there.tension, rtol=0.0, atol=1e-8)  # 1e-13 m of stiff tendons
+        assert_allclose(one.jacobian(), two.jacobian(), rtol=1e-6, atol=1e-7)
+    assert_array_equal(
+        Simulator(poked(rod(), 0.0, 0.031)).settle(lengths).tension,
+        Simulator(rod()).settle(lengths, point_force=[(0.031, (0.0, 0.0, 0.0))]).tension,
+    )
+    beyond = Simulator(poked(rod(), 0.1, 0.9)).settle(lengths, tolerance=1e-13)
+    at_tip = Simulator(rod()).settle(lengths, tip_force=(0.0, 0.1, 0.0), tolerance=1e-13)
+    assert_allclose(beyond.position, at_tip.position, atol=1e-13)
+    broken = np.tile(lengths, (2, 1))
+    broken[1, 2] = np.nan
+    assert one.settle(broken).ok.tolist() == [True, False]
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_the_jacobian_keeps_what_effects_add_beside_a_point_force() -> None:
+    robot = having(
+        poked(rod(extension=(-0.01, 0.01)), 0.1, 0.031),
+        {"name": "poke", "force": 0.1, "arclength": 0.031},
+        {"name": "gravity", "line_density": 0.3},
+    )
+    sim = Simulator(robot, points_per_segment=4)
+    base = {"tendon_length": bend(robot, 0.5, -0.3), "extension": np.array([0.001])}
+    assert sim.settle(**base, tolerance=1e-13).ok.all()
+    jacobian = sim.jacobian()[0]
+    expected = difference(sim, base, "extension", 0, 1e-6)
+    assert_allclose(jacobian[:, 4], expected, atol=5e-6 * np.abs(expected).max())
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_material_force_of_an_effect_turns_with_the_rod() -> None:
+    lengths, half = bend(rod(), 0.9, -0.4), np.sqrt(0.5)
+    sim = Simulator(poked(rod(), 0.1, 0.031, "lean"))
+    first = sim.settle(lengths, tolerance=1e-13)
+    for _ in range(8):  # each by the shape of the one before
+        state = sim.settle(lengths, tolerance=1e-13)
+    assert np.abs(state.position - first.position).max() > 1e-6
+    force = sim.shape(0.031).rotation[0, 0] @ [0.0, 0.1, 0.0]
+    there = Simulator(rod()).settle(lengths, point_force=[(0.031, force)], tolerance=1e-13)
+    assert_allclose(state.position, there.position, atol=1e-11)
+    turned = sim.settle(lengths, base_pose=(0.1, 0.2, 0.3, half, half, 0.0, 0.0), tolerance=1e-13)
+    quarter = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # about x
+    assert_allclose(turned.position[0], state.position[0] @ quarter.T + [0.1, 0.2, 0.3], atol=1e-11)
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_point_force_that_cannot_be_is_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    short = Simulator(poked(rod(), 0.1, 0.031, "lean"), outputs="tip")
+    lengths = bend(rod(), 0.5, 0.0)
+    short.step(lengths)  # straight before
+    with pytest.raises(EffectError, match="material frame goes by the last shape; outputs='tip' keeps no"):
+        short.step(lengths)
+    monkeypatch.setattr(Poke, "frame", "materiel")
+    with pytest.raises(EffectError, match="no frame 'materiel' of a point force; did you mean 'material'"):
+        Simulator(poked(rod(), 0.1, 0.031)).step(lengths)
+    monkeypatch.setattr(
+        Poke, "apply", lambda self, values, memory, ports, state, dt: ports.add_point_force(0.1, (1.0, 2.0))
+    )
+    with pytest.raises(EffectError, match=r"force of shape \(2,\); give \(1,\) \[m\] and \(1, 3\) \[N\]"):
+        Simulator(poked(rod(), 0.1, 0.031)).step(lengths)
 
 
 def variant(name: str = "Weight", **changes: Any) -> type:

@@ -1,5 +1,4 @@
-"""The line on stderr before kernels are compiled: in scripts too, once a process, and not where they are
-cached."""
+"""The line on stderr before kernels are compiled: once a process, and not where they are cached."""
 
 from __future__ import annotations
 
@@ -27,10 +26,9 @@ LINE = "Compiling kernels, about 30 s, "
 def said(folder: Path | str, **environment: str) -> str:
     """Stderr of the script with its cache in `folder`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("FASTROD_", "XDG_"))}
-    there = {"FASTROD_CACHE_DIR": str(folder), **environment}
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], env=kept | there, check=True, capture_output=True, text=True
-    )
+    there = kept | {"FASTROD_CACHE_DIR": str(folder), **environment}
+    words = [sys.executable, "-c", SCRIPT]
+    done = subprocess.run(words, env=there, check=True, capture_output=True, text=True)
     assert done.stdout == "done\n"
     return done.stderr
 

@@ -118,7 +118,7 @@ def test_it_works_in_an_empty_environment_with_one_extra(extra: str, wheel: Path
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    told = subprocess.run(
+    reported = subprocess.run(
         [python.parent / "fastrod", "--version"], env=environment, capture_output=True, text=True, check=True
     ).stdout
-    assert told.strip().endswith(wheel.name.split("-")[1])
+    assert reported.strip().endswith(wheel.name.split("-")[1])

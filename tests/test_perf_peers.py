@@ -14,6 +14,14 @@ import pytest
 from numpy.testing import assert_allclose
 from truthfiles import numbers, rows
 
+import appendix_j
+import bench_peers
+import peer_elastica
+import peer_mujoco
+import peer_pybullet
+from bench_peers import Ratio, error_ratio, rms, time_ratio
+from fastrod.reference import shoot
+
 NAMES = (
     "fastrod, settle",
     "fastrod, step",
@@ -31,14 +39,7 @@ RELAXED = ("MuJoCo", "PyBullet", "PyElastica")
 SLOWEST = 3  # rungs that are tried here: the finer ones of the slow peers take seconds
 
 
-@pytest.fixture(autouse=True)
-def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "perf"))
-
-
 def peer(name: str) -> Any:
-    import bench_peers
-
     (found,) = (one for one in bench_peers.PEERS if one.name == name)
     if sentence := found.missing():
         pytest.skip(sentence)
@@ -46,23 +47,16 @@ def peer(name: str) -> Any:
 
 
 def error(rung: Any, force: np.ndarray) -> float:
-    import appendix_j
-    from bench_peers import rms
-
     with rung.build() as solve:
         return rms(solve(force), appendix_j.tips(force))
 
 
 def test_the_names_are_all() -> None:
-    import bench_peers
-
     assert {one.name for one in bench_peers.PEERS} == {*NAMES, *COMPILED_LONG}
     assert all(one.family in bench_peers.COLOURS and one.same and one.also for one in bench_peers.PEERS)
 
 
 def test_the_elastica_is_the_truth_of_appendix_j() -> None:
-    import appendix_j
-
     truth = [numbers(row, "Fy_N", "tip_y_m", "tip_z_m") for row in rows("appJ_truth.csv")]
     force, tips = np.array(truth)[:, 0], np.array(truth)[:, 1:]
     assert_allclose(force, appendix_j.FORCES, atol=1e-12)
@@ -70,9 +64,6 @@ def test_the_elastica_is_the_truth_of_appendix_j() -> None:
 
 
 def test_the_elastica_is_the_slow_twin() -> None:
-    import appendix_j
-    from fastrod.reference import shoot
-
     shape = shoot(appendix_j.robot(), tip_force=(0.0, 0.7, 0.0))
     assert shape.success
     assert_allclose(appendix_j.tips(np.array([0.7]))[0], shape.tip_position[1:], rtol=0, atol=1e-8)
@@ -90,8 +81,6 @@ def test_a_finer_setting_is_nearer_to_the_truth(name: str) -> None:
 def test_the_coarsest_setting_that_takes_long_to_compile(name: str) -> None:
     """One arc under a small load: EI l u = F l^2/2, so the tip goes u l^2/2 = F l^3/4EI, 3/4 of the rod's F
     l^3/3EI."""
-    import appendix_j
-
     force = np.array([0.01])
     with peer(name).rungs[0].build() as solve:
         across = solve(force)[0, 0]
@@ -101,11 +90,6 @@ def test_the_coarsest_setting_that_takes_long_to_compile(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(RELAXED)])
 def test_what_is_relaxed_is_at_rest(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With half as much patience again the tip moves by less than a fifth of what it is off."""
-    import appendix_j
-    import peer_elastica
-    import peer_mujoco
-    import peer_pybullet
-
     force, truth = np.array([0.3, 0.6]), appendix_j.tips(np.array([0.3, 0.6]))
     rung = peer(name).rungs[1]
     with rung.build() as solve:
@@ -150,8 +134,6 @@ def test_all_in_one_call_is_one_after_the_other(name: str) -> None:
 
 
 def test_ratios_are_read_between_the_measured_settings_and_never_beyond() -> None:
-    from bench_peers import Ratio, error_ratio, time_ratio
-
     own = [(1e-3, 1e-4), (2e-3, 1e-6), (4e-3, 1e-8)]
     assert time_ratio(1e-5, 1.0, own).value == pytest.approx(1.0 / math.sqrt(2e-6))
     assert time_ratio(1e-3, 1.0, own) == Ratio(1e3, least=True)
@@ -167,8 +149,6 @@ def test_ratios_are_read_between_the_measured_settings_and_never_beyond() -> Non
 
 
 def test_only_points_that_none_beats_are_on_the_front() -> None:
-    import bench_peers
-
     made = [
         bench_peers.Point(None, None, error, time, 0.0)
         for error, time in ((1e-3, 1.0), (1e-4, 3.0), (1e-2, 2.0), (1e-5, 2.5))
@@ -179,8 +159,6 @@ def test_only_points_that_none_beats_are_on_the_front() -> None:
 def test_the_bench_runs_and_what_is_missing_is_a_sentence(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    import bench_peers
-
     absent = replace(peer("fastrod, step"), name="Unheard", modules=("unheard_of",))
     monkeypatch.setattr(bench_peers, "PEERS", [peer("fastrod, settle"), peer("scipy solve_bvp"), absent])
     file = tmp_path / "peers.png"

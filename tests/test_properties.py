@@ -55,8 +55,7 @@ def test_the_base_carries_the_tip_force_and_its_moment(x: float, y: float, load:
 @same_every_time
 @given(angle, angle, force)
 def test_a_mirror_image_bends_into_the_mirror_image(x: float, y: float, load: tuple[float, ...]) -> None:
-    """Reflected in the plane x = 0: forces turn their x, bends about d2 turn their sign; the wires at +x and
-    -x change places."""
+    """In the plane x = 0: forces change their x, bends about d2 their sign, the x tendons their places."""
     sim, lengths = settled("tendon_length", x, y, load)
     one = sim.settle(lengths, tip_force=load, tolerance=1e-11)
     two = sim.settle(lengths[[2, 1, 0, 3]], tip_force=np.multiply(load, (-1, 1, 1)), tolerance=1e-11)
@@ -67,8 +66,7 @@ def test_a_mirror_image_bends_into_the_mirror_image(x: float, y: float, load: tu
 @same_every_time
 @given(angle, angle, force)
 def test_compliance_is_symmetric(x: float, y: float, load: tuple[float, ...]) -> None:
-    """Maxwell and Betti: with dead loads and held wires the tip gives as much to one force as to the
-    other."""
+    """Maxwell and Betti: with dead loads and held tendons the tip gives as much to one force as another."""
     sim, lengths = settled("tendon_length", x, y, load)
     sim.settle(lengths, tip_force=load, tolerance=1e-11)
     compliance = sim.compliance()[0, :3]

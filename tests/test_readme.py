@@ -37,9 +37,8 @@ def test_the_example_prints_its_output(code: str, output: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
-    links = [
-        link.partition("#")[0] for link in re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8"))
-    ]
+    found = re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8"))
+    links = [link.partition("#")[0] for link in found]
     assert [link for link in links if link and "://" not in link and not (page.parent / link).exists()] == []
 
 
@@ -51,11 +50,8 @@ def test_ci_runs_the_test_line() -> None:
 
 
 def test_the_page_of_scenes_has_them_all() -> None:
-    rows = re.findall(
-        r"^\| `(\w+)` \| (.*) \| ([\d.]+) s \|$",
-        (ROOT / "scenes" / "README.md").read_text(encoding="utf-8"),
-        flags=re.M,
-    )
+    text = (ROOT / "scenes" / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \| ([\d.]+) s \|$", text, flags=re.M)
     scenes = [fastrod_scenes.load(name) for name in fastrod_scenes.names()]
     assert rows == [(scene.name, scene.about, f"{scene.duration:.1f}") for scene in scenes]
 
@@ -67,11 +63,7 @@ def test_every_command_on_a_page_is_one(page: Path) -> None:
 
     parser, _ = build()
     blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)
-    lines = [
-        line.partition("#")[0].split()[1:]
-        for block in blocks
-        for line in block.splitlines()
-        if line.startswith("fastrod ")
-    ]
+    commands = re.findall(r"^fastrod (.*)$", "\n".join(blocks), flags=re.M)
+    lines = [line.partition("#")[0].split() for line in commands]
     unknown = [words for words in lines if parser.parse_known_args(words)[1]]
     assert unknown == []

@@ -1,71 +1,65 @@
 """The recorder: what is recorded is what is read back, and what a killed session has left is not lost."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.errors import InputError, LogError
 from fastrod.logs.link import Measurement
 from fastrod.logs.recording import Recorder, free_path, recover
-from fastrod.logs.runlog import RunLog, read_log
-from fastrod.model.robot import Robot
-from fastrod.types import Floats
+from fastrod.logs.runlog import read_log
 
 ROBOT = fastrod.load_robot("prototype")
+GROUPS = "t run dl tip_position ext tip_quaternion points tip_force payload base_quaternion"
 
 
-def reading(t: float, rng: np.random.Generator, robot: Robot = ROBOT) -> Measurement:
+def measured(t, **given):
+    """A straight robot at this time, unless given."""
+    pose = {"tip_position": (0.0, 0.0, 0.07), "tip_quaternion": (1.0, 0.0, 0.0, 0.0)}
+    return Measurement(**({"t": t, "dl": np.zeros(4), "ext": [0.0], "tension": np.zeros(4)} | pose | given))
+
+
+def reading(t, rng):
     quaternion = rng.normal(size=4)
-    return Measurement(
-        t=t,
-        dl=rng.uniform(-0.005, 0.005, robot.n_tendons),
-        ext=np.zeros(robot.n_segments),
+    return measured(
+        t,
+        dl=rng.uniform(-0.005, 0.005, ROBOT.n_tendons),
         tip_position=rng.uniform(-0.05, 0.05, 3),
         tip_quaternion=quaternion / np.linalg.norm(quaternion),
-        tension=rng.uniform(0.0, 3.0, robot.n_tendons),
+        tension=rng.uniform(0.0, 3.0, ROBOT.n_tendons),
     )
 
 
-def filled(recorder: Recorder, n: int = 200, seed: int = 3) -> Recorder:
+def started(path=None, **options):
+    """A recorder at work."""
+    recorder = Recorder(ROBOT, path, **options)
+    recorder.start(0.0)
+    return recorder
+
+
+def filled(recorder, n=200, seed=3):
     """Two runs of `n` rows, the second with a payload."""
     rng = np.random.default_rng(seed)
     for run, payload in (("free", 0.0), ("loaded", 0.02)):
         recorder.start(10.0, run)
         for k in range(n):
-            recorder.add(
-                reading(10.0 + 0.02 * k, rng),
-                payload=payload,
-                commanded_dl=rng.uniform(-0.005, 0.005, ROBOT.n_tendons),
-            )
+            now, commanded = reading(10.0 + 0.02 * k, rng), rng.uniform(-0.005, 0.005, ROBOT.n_tendons)
+            recorder.add(now, payload=payload, commanded_dl=commanded)
     return recorder
 
 
-def assert_same(a: RunLog, b: RunLog) -> None:
-    for name in (
-        "t",
-        "run",
-        "dl",
-        "tip_position",
-        "ext",
-        "tip_quaternion",
-        "points",
-        "tip_force",
-        "payload",
-        "base_quaternion",
-    ):
+def assert_same(a, b):
+    for name in GROUPS.split():
         one, other = getattr(a, name), getattr(b, name)
         assert (one is None) == (other is None), name
         if one is not None:
@@ -75,21 +69,32 @@ def assert_same(a: RunLog, b: RunLog) -> None:
         assert_array_equal(numbers(cells), numbers(b.extra[name]), err_msg=name)
 
 
-def numbers(cells: object) -> Floats:
+def numbers(cells):
     """A column of numbers, or of what a CSV has in their place."""
     return np.array([float(cell or "nan") if isinstance(cell, str) else cell for cell in cells])
 
 
+def names(folder):
+    return sorted(file.name for file in folder.iterdir())
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A folder for what a killed session would leave."""
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    return folder
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_recording_reads_back_bit_for_bit(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_reads_back_bit_for_bit(tmp_path, suffix):
     path = tmp_path / f"session{suffix}"
     recorder = filled(Recorder(ROBOT, path))
-    assert recorder.recording
-    assert len(recorder) == 400
+    assert (recorder.recording, len(recorder)) == (True, 400)
     log = recorder.stop()
     assert not recorder.recording
     assert_same(log, read_log(path, ROBOT))
-    assert sorted(file.name for file in tmp_path.iterdir()) == [path.name]
+    assert names(tmp_path) == [path.name]
     assert log.runs == ["free", "loaded"]
     assert log.measured.all()
     assert log.payload is not None
@@ -99,63 +104,35 @@ def test_a_recording_reads_back_bit_for_bit(tmp_path: Path, suffix: str) -> None
     assert sorted(log.extra) == [f"{what}_{k}" for what in ("cmd_dl", "tension") for k in range(1, 5)]
 
 
-def test_what_is_missing_stays_missing(tmp_path: Path) -> None:
+def test_what_is_missing_stays_missing(tmp_path):
     path = tmp_path / "session.csv"
-    recorder = Recorder(ROBOT, path)
-    recorder.start(0.0)
-    unknown = np.full(3, np.nan)
+    recorder, none = started(path), {"tip_quaternion": [np.nan] * 4, "tension": [np.inf] * 4}
     for k in range(3):
-        tip = unknown if k == 1 else np.array([0.0, 0.0, 0.07])
+        tip = [np.nan] * 3 if k == 1 else [0.0, 0.0, 0.07]
         force = (0.1, 0.0, 0.0) if k == 2 else None
-        given = Measurement(
-            t=k,
-            dl=np.zeros(4),
-            ext=np.zeros(1),
-            tip_position=tip,
-            tip_quaternion=np.full(4, np.nan),
-            tension=[np.inf] * 4,
-        )
-        recorder.add(given, tip_force=force)
+        recorder.add(measured(k, tip_position=tip, **none), tip_force=force)
     log = recorder.stop()
     assert_same(log, read_log(path, ROBOT))
     assert log.measured.tolist() == [True, False, True]
     assert log.tip_quaternion is None
     assert log.extra == {}  # no tension was finite and nothing was commanded
-    assert log.tip_force is not None
     assert_array_equal(log.tip_force, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
     assert log.runs == [""]
 
 
-def test_a_robot_that_extends_has_its_extension_recorded(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    longer = replace(
-        ROBOT, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in ROBOT.segments)
-    )
+def test_a_robot_that_extends_has_its_extension_recorded(tmp_path):
+    longer = replace(ROBOT, segments=(replace(ROBOT.segments[0], extension=(0.0, 0.02)),))
     recorder = Recorder(longer, tmp_path / "session.csv")
     recorder.start(0.0)
-    recorder.add(
-        Measurement(
-            t=0.0,
-            dl=np.zeros(4),
-            ext=[0.01],
-            tip_position=[0, 0, 0.08],
-            tip_quaternion=[1, 0, 0, 0],
-            tension=np.zeros(4),
-        )
-    )
+    recorder.add(measured(0.0, ext=[0.01], tip_position=[0.0, 0.0, 0.08]))
     log = recorder.stop()
-    assert log.ext is not None
     assert_array_equal(log.ext, [[0.01]])
     assert_same(log, read_log(tmp_path / "session.csv", longer))
 
 
-def test_a_killed_session_is_recovered_row_by_row(tmp_path: Path) -> None:
-    path, kept = tmp_path / "session.csv", tmp_path / "kept"
-    kept.mkdir()
-    recorder = filled(Recorder(ROBOT, path))
-    # as it lies there while rows still come
-    (kept / "session.csv.part").write_bytes((tmp_path / "session.csv.part").read_bytes())
+def test_a_killed_session_is_recovered_row_by_row(tmp_path, kept):
+    recorder = filled(Recorder(ROBOT, tmp_path / "session.csv"))
+    shutil.copy(tmp_path / "session.csv.part", kept)  # as it lies there while rows still come
     whole = recorder.stop()
     log = recover(kept / "session.csv")
     assert_same(log, whole)
@@ -163,43 +140,56 @@ def test_a_killed_session_is_recovered_row_by_row(tmp_path: Path) -> None:
     assert not (kept / "session.csv.part").exists()
 
 
-def test_a_row_cut_short_is_left_out(tmp_path: Path) -> None:
-    path, kept = tmp_path / "session.csv", tmp_path / "kept"
-    kept.mkdir()
-    recorder = filled(Recorder(ROBOT, path), n=5)
-    text = (tmp_path / "session.csv.part").read_text()
-    (kept / "session.csv.part").write_text(text[:-9])
+def test_a_row_cut_short_is_left_out(tmp_path, kept):
+    recorder = filled(Recorder(ROBOT, tmp_path / "session.csv"), n=5)
+    (kept / "session.csv.part").write_text((tmp_path / "session.csv.part").read_text()[:-9])
     whole = recorder.stop()
     assert_same(recover(kept / "session.csv.part"), whole.rows(slice(0, 9)))
 
 
-CHILD = """
+HEAD = """
 import sys
 from pathlib import Path
 import numpy as np
 import fastrod
+from fastrod.errors import InputError
 from fastrod.logs.link import Measurement
 from fastrod.logs.recording import Recorder
 
 recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]), extra=["current_1"])
-recorder.start(0.0, "killed")
+recorder.start(0.0)
+def add(k, tip):
+    moved = dict(dl=[1e-3 / 3] * 4, ext=[0.0], tension=[1.0] * 4)
+    seen = Measurement(t=k, tip_position=tip, tip_quaternion=[1.0, 0.0, 0.0, 0.0], **moved)
+    recorder.add(seen, extra={"current_1": float(k)})
+"""
+KILLED = """
 while True:
     k = len(recorder)
-    tip = [np.nan] * 3 if k % 7 == 3 else [1e-6 * k, 0.0, 0.07]
-    turn = [1.0, 0.0, 0.0, 0.0]
-    moved = dict(dl=[0.0] * 4, ext=[0.0], tension=[1.0] * 4)
-    seen = Measurement(t=0.02 * k, tip_position=tip, tip_quaternion=turn, **moved)
-    recorder.add(seen, extra={"current_1": float(k)})
+    add(k, [np.nan] * 3 if k % 7 == 3 else [1e-6 * k, 0.0, 0.07])
     print(len(recorder), flush=True)
+"""
+FULL = """
+import resource
+hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+for k in range(10):
+    if k in (4, 5):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (Path(sys.argv[1] + ".part").stat().st_size + 40, hard))
+        try:
+            add(k, [0.1 / 3] * 3)
+        except InputError as error:
+            print(error)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    else:
+        add(k, [0.1 / 3] * 3)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
-def test_a_process_that_is_killed_loses_no_row(tmp_path: Path) -> None:
+def test_a_process_that_is_killed_loses_no_row(tmp_path):
     path = tmp_path / "session.csv"
-    child = subprocess.Popen([sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True)
-    assert child.stdout is not None
-    with child:
+    command = [sys.executable, "-c", HEAD + KILLED, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         while int(child.stdout.readline()) < 100:
             pass
         os.kill(child.pid, signal.SIGKILL)
@@ -215,148 +205,100 @@ def test_a_process_that_is_killed_loses_no_row(tmp_path: Path) -> None:
     assert_same(log, read_log(path, ROBOT))
 
 
-def test_each_row_is_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(7)
-    # a row beyond any buffer
-    recorder = Recorder(ROBOT, tmp_path / "session.csv", extra=[f"further_{k}" for k in range(900)])
-    recorder.start(0.0)
-    written: list[int] = []
-
-    class Counted:
-        """The file, counting."""
-
-        def __init__(self, file: object) -> None:
-            self.file = file
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(self.file, name)
-
-        def write(self, data: bytes) -> int:
-            written.append(len(data))
-            return self.file.write(data)
-
-    monkeypatch.setattr(recorder, "_file", Counted(recorder._file))
-    for k in range(5):
-        recorder.add(reading(0.1 * k, rng), extra={f"further_{j}": rng.normal() for j in range(900)})
-        assert len(written) == k + 1
-        assert (tmp_path / "session.csv.part").stat().st_size > sum(written)  # and the head
-        assert (tmp_path / "session.csv.part").read_bytes().endswith(b"\n")
-    assert min(written) > 8192
-    assert len(recorder.stop()) == 5
-
-
-FULL = """
-import resource, sys
-from pathlib import Path
-import fastrod
-from fastrod.errors import InputError
-from fastrod.logs.link import Measurement
-from fastrod.logs.recording import Recorder
-
-recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]))
-recorder.start(0.0)
-def add(k):
-    tip, turn = [0.1 / 3] * 3, [1, 0, 0, 0]
-    moved = dict(dl=[1e-3 / 3] * 4, ext=[0], tension=[1] * 4)
-    recorder.add(Measurement(t=k, tip_position=tip, tip_quaternion=turn, **moved))
-hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-for k in range(10):
-    if k in (4, 5):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (Path(sys.argv[1] + ".part").stat().st_size + 40, hard))
-        try:
-            add(k)
-        except InputError as error:
-            print(error)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-    else:
-        add(k)
-"""
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="resource limits")
-def test_a_disk_that_was_full_leaves_whole_rows(tmp_path: Path) -> None:
+def test_a_disk_that_was_full_leaves_whole_rows(tmp_path):
     path = tmp_path / "session.csv"
-    said = subprocess.run(
-        [sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True
-    ).stdout
+    command = [sys.executable, "-c", HEAD + FULL, str(path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     why, where = "session.csv.part cannot be written: File too large", "are in session.csv.part."
     assert said.splitlines() == [f"{why}; {rows} {where}" for rows in ("4 of its 5 rows", "4 of its 6 rows")]
     assert recover(path).t.tolist() == [0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 8.0, 9.0]
 
 
+def test_each_row_is_one_write(tmp_path, monkeypatch):
+    rng, further, written = np.random.default_rng(7), [f"further_{k}" for k in range(900)], []
+    recorder, partial = started(tmp_path / "session.csv", extra=further), tmp_path / "session.csv.part"
+    file = recorder._file
+
+    class Counted:
+        """The file, counting."""
+
+        def __getattr__(self, name):
+            return getattr(file, name)
+
+        def write(self, data):
+            written.append(len(data))
+            return file.write(data)
+
+    monkeypatch.setattr(recorder, "_file", Counted())
+    for k in range(5):
+        recorder.add(reading(0.1 * k, rng), extra={name: rng.normal() for name in further})
+        assert len(written) == k + 1
+        assert partial.stat().st_size > sum(written)  # and the head
+        assert partial.read_bytes().endswith(b"\n")
+    assert min(written) > 8192  # a row beyond any buffer
+    assert len(recorder.stop()) == 5
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_further_columns_and_the_bases_orientation_are_kept(tmp_path: Path, suffix: str) -> None:
-    path, kept = tmp_path / f"session{suffix}", tmp_path / "kept"
-    kept.mkdir()
-    rng = np.random.default_rng(11)
-    recorder = Recorder(ROBOT, path, extra=["following error [m]", "never"])
-    recorder.start(0.0)
+def test_further_columns_and_the_bases_orientation_are_kept(tmp_path, kept, suffix):
+    path, rng = tmp_path / f"session{suffix}", np.random.default_rng(11)
+    recorder = started(path, extra=["following error [m]", "never"])
     errors, bases = rng.normal(size=6), rng.normal(size=(6, 4))
     bases /= np.linalg.norm(bases, axis=1)[:, None]
     for k in range(6):
         given = None if k == 2 else {"following error [m]": np.inf if k == 4 else errors[k]}
         recorder.add(reading(0.1 * k, rng), base_quaternion=None if k == 3 else bases[k], extra=given)
-    partial = (tmp_path / f"{path.name}.part").read_bytes()
-    (kept / f"{path.name}.part").write_bytes(partial)
+    shutil.copy(tmp_path / f"{path.name}.part", kept)
     log = recorder.stop()
     expected = np.where(np.isin(np.arange(6), (2, 4)), np.nan, errors)
     assert_array_equal(numbers(log.extra["following error [m]"]), expected)
     assert np.isnan(numbers(log.extra["never"])).all()
-    assert log.base_quaternion is not None
-    np.testing.assert_allclose(
-        log.base_quaternion[[0, 1, 2, 4, 5]], bases[[0, 1, 2, 4, 5]], rtol=0.0, atol=1e-15
-    )
-    assert np.isnan(log.base_quaternion[3]).all()
+    bases[3] = np.nan
+    assert_allclose(log.base_quaternion, bases, rtol=0.0, atol=1e-15)
     assert_same(log, read_log(path, ROBOT))
     assert_same(recover(kept / path.name), log)
 
 
-def test_an_orientation_that_nobody_gave_is_none(tmp_path: Path) -> None:
-    recorder = filled(Recorder(ROBOT, tmp_path / "session.csv", extra=("temperature",)), n=3)
-    log = recorder.stop()
+def test_an_orientation_that_nobody_gave_is_none(tmp_path):
+    log = filled(Recorder(ROBOT, tmp_path / "session.csv", extra=("temperature",)), n=3).stop()
     assert log.base_quaternion is None
     assert np.isnan(numbers(log.extra["temperature"])).all()
     assert "base_qw" not in (tmp_path / "session.csv").read_text()
 
 
+NO_COLUMNS = [
+    (["a", "a"], "'a' is named twice"),
+    (["tension_9"], "'tension_9' is a name that run logs have"),
+    *(([name], "for something else") for name in ("dl_12", "base_qx", "p3_z", "t")),
+    *(([name], "is no name") for name in ("a,b", "a\nb", " a", "", 3)),
+    ("current", "give a list of names"),
+]
+
+
+@pytest.mark.parametrize(("columns", "sentence"), NO_COLUMNS)
+def test_a_further_column_that_cannot_be_one_is_refused(columns, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Recorder(ROBOT, extra=columns)
+
+
 @pytest.mark.parametrize(
-    ("names", "sentence"),
+    ("given", "sentence"),
     [
-        (["a", "a"], "'a' is named twice"),
-        (["tension_9"], "'tension_9' is a name that run logs have"),
-        (["dl_12"], "for something else"),
-        (["base_qx"], "for something else"),
-        (["p3_z"], "for something else"),
-        (["t"], "for something else"),
-        (["a,b"], "is no name"),
-        (["a\nb"], "is no name"),
-        ([" a"], "is no name"),
-        ([""], "is no name"),
-        ([3], "is no name"),
-        ("current", "give a list of names"),
+        ({"extra": {"curent_1": 1.0}}, r"no column 'curent_1' is recorded; did you mean 'current_1'\?"),
+        ({"extra": {"current_1": "much"}}, r"extra of the reading is .*it must be numbers"),
+        ({"base_quaternion": (1.0, 0.0, 0.0)}, r"base_quaternion of the reading has shape \(3,\)"),
+        ({"base_quaternion": (2.0, 0.0, 0.0, 0.0)}, "of norm 2; it must be 1"),
     ],
 )
-def test_a_further_column_that_cannot_be_one_is_refused(names: list[str], sentence: str) -> None:
+def test_a_number_that_cannot_be_kept_is_refused(given, sentence):
+    recorder = started(extra=["current_1", "current_2"])
     with pytest.raises(InputError, match=sentence):
-        Recorder(ROBOT, extra=names)
-
-
-def test_a_number_that_cannot_be_kept_is_refused() -> None:
-    rng = np.random.default_rng(5)
-    recorder = Recorder(ROBOT, extra=["current_1", "current_2"])
-    recorder.start(0.0)
-    with pytest.raises(InputError, match=r"no column 'curent_1' is recorded; did you mean 'current_1'\?"):
-        recorder.add(reading(0.0, rng), extra={"curent_1": 1.0})
-    with pytest.raises(InputError, match=r"extra of the reading is .*it must be numbers"):
-        recorder.add(reading(0.0, rng), extra={"current_1": "much"})
-    with pytest.raises(InputError, match=r"base_quaternion of the reading has shape \(3,\)"):
-        recorder.add(reading(0.0, rng), base_quaternion=(1.0, 0.0, 0.0))
-    with pytest.raises(InputError, match="of norm 2; it must be 1"):
-        recorder.add(reading(0.0, rng), base_quaternion=(2.0, 0.0, 0.0, 0.0))
+        recorder.add(measured(0.0), **given)
     assert len(recorder) == 0
 
 
-def test_nothing_to_recover_is_said(tmp_path: Path) -> None:
+def test_nothing_to_recover_is_said(tmp_path):
     with pytest.raises(LogError, match=r"session.csv.part' cannot be recovered: No such file"):
         recover(tmp_path / "session.csv")
     (tmp_path / "empty.csv.part").write_text("t,run,dl_1,tip_x,tip_y,tip_z\n")
@@ -370,7 +312,7 @@ def test_nothing_to_recover_is_said(tmp_path: Path) -> None:
         recover(tmp_path / "other.csv")
 
 
-def test_a_failed_end_keeps_the_partial_file(tmp_path: Path) -> None:
+def test_a_failed_end_keeps_the_partial_file(tmp_path):
     path = tmp_path / "session.csv"
     recorder = filled(Recorder(ROBOT, path), n=5)
     path.mkdir()  # somebody takes the name meanwhile
@@ -380,61 +322,47 @@ def test_a_failed_end_keeps_the_partial_file(tmp_path: Path) -> None:
     assert len(recover(path)) == 10
 
 
-def leave(folder: Path) -> None:
-    shutil.rmtree(folder)
-
-
-def rename(folder: Path) -> None:
-    folder.rename(folder.with_name("renamed"))
-
-
-def unlink(folder: Path) -> None:
+def unlink(folder):
     (folder / "session.csv.part").unlink()
 
 
-def replace_partial(folder: Path) -> None:
+def replace_partial(folder):
     unlink(folder)
     (folder / "session.csv.part").write_text("another's\n")
 
 
-def block(folder: Path) -> None:
-    leave(folder)
+def block(folder):
+    shutil.rmtree(folder)
     folder.write_text("a file has its name now")
 
 
+CHANGES = {
+    "removed": (shutil.rmtree, "logs/session.csv"),
+    "renamed": (lambda folder: folder.rename(folder.with_name("renamed")), "logs/session.csv"),
+    "file removed": (unlink, "logs/session.csv"),
+    "file replaced": (replace_partial, "logs/session-2.csv"),
+    "blocked": (block, "temporary/session.csv"),
+}
+
+
 @pytest.mark.parametrize("at_the_end", [False, True], ids=["while rows come", "before the end"])
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        (leave, "logs/session.csv"),
-        (rename, "logs/session.csv"),
-        (unlink, "logs/session.csv"),
-        (replace_partial, "logs/session-2.csv"),
-        (block, "temporary/session.csv"),
-    ],
-)
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_log_that_was_removed_or_renamed_is_written_again_with_every_row(
-    change: Callable[[Path], None],
-    name: str,
-    at_the_end: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    folder, said = tmp_path / "logs", []
+    change, at_the_end, tmp_path, monkeypatch
+):
+    (do, name), folder, said = CHANGES[change], tmp_path / "logs", []
     for made in (folder, tmp_path / "temporary"):
         made.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    rng = np.random.default_rng(1)
+    rng, partial = np.random.default_rng(1), tmp_path / f"{name}.part"
     recorder = Recorder(ROBOT, folder / "session.csv", on_move=said.append)
     recorder.start(0.0, "one")
     for k in range(20):
         recorder.add(reading(0.1 * k, rng))
-    change(folder)
+    do(folder)
     if not at_the_end:
         recorder.add(reading(2.0, rng))  # the first row after it notices
-        partial = tmp_path / f"{name}.part"
-        assert recorder.path == tmp_path / name
-        assert said == [recorder.moved]
+        assert (recorder.path, said) == (tmp_path / name, [recorder.moved])
         assert "was removed or renamed while it was recorded; all 21 rows are in" in said[0]
         assert repr(str(partial)) in said[0]
         assert partial.read_text().count("\n") == 23  # with comment and header
@@ -445,23 +373,21 @@ def test_a_log_that_was_removed_or_renamed_is_written_again_with_every_row(
     assert len(log) == (20 if at_the_end else 22)
     assert_same(read_log(tmp_path / name, ROBOT), log)
     assert len(said) == 1
-    assert not (tmp_path / f"{name}.part").exists()
-    if change is replace_partial:
+    assert not partial.exists()
+    if change == "file replaced":
         assert (folder / "session.csv.part").read_text() == "another's\n"
 
 
-def test_rows_that_no_place_takes_are_in_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_that_no_place_takes_are_in_no_file(tmp_path, monkeypatch):
     folder = tmp_path / "logs"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder / "none"))
-    rng = np.random.default_rng(1)
-    recorder = Recorder(ROBOT, folder / "session.csv")
-    recorder.start(0.0)
-    recorder.add(reading(0.0, rng))
+    recorder = started(folder / "session.csv")
+    recorder.add(measured(0.0))
     block(folder)
     for k in (1, 2):
         with pytest.raises(InputError, match=rf"was removed .* written: .*; its {k + 1} rows are in no file"):
-            recorder.add(reading(float(k), rng))
+            recorder.add(measured(float(k)))
     with pytest.raises(InputError, match=r"its 3 rows are in no file\."):
         recorder.stop()
     assert not recorder.recording
@@ -474,13 +400,15 @@ def test_rows_that_no_place_takes_are_in_no_file(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_full_disk_keeps_what_it_took_and_nothing_half_written(small_disk: Path, suffix: str) -> None:
-    path = small_disk / f"session{suffix}"
-    rng = np.random.default_rng(2)
-    recorder = Recorder(ROBOT, path)
-    recorder.start(0.0)
+def test_a_full_disk_keeps_what_it_took_and_nothing_half_written(small_disk, suffix):
+    path, rng = small_disk / f"session{suffix}", np.random.default_rng(2)
+    recorder = started(path)
     recorder.add(reading(0.0, rng))
-    fill(small_disk, leave=20_000)
+    filler = small_disk / "filler"  # takes all room but about 20 kB
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    os.truncate(filler, filler.stat().st_size - 20_000)
     with pytest.raises(InputError, match="No space left on device") as refused:  # noqa: PT012 - how many fit?
         for k in range(1, 1000):
             recorder.add(reading(0.1 * k, rng))
@@ -490,28 +418,18 @@ def test_a_full_disk_keeps_what_it_took_and_nothing_half_written(small_disk: Pat
     assert f"{sentence}." in str(refused.value)
     with pytest.raises(InputError, match=f"No space left on device{sentence}, see `recover`"):
         recorder.stop()
-    assert sorted(file.name for file in small_disk.iterdir()) == ["filler", f"session{suffix}.part"]
-    (small_disk / "filler").unlink()
+    assert names(small_disk) == ["filler", f"session{suffix}.part"]
+    filler.unlink()
     assert len(recover(path)) == n - 1
 
 
-def fill(disk: Path, leave: int) -> None:
-    """Take all room but about so many bytes."""
-    with (disk / "filler").open("wb", buffering=0) as file, suppress(OSError):
-        while True:
-            file.write(bytes(4096))
-    os.truncate(disk / "filler", (disk / "filler").stat().st_size - leave)
-
-
-def test_without_a_path_rows_stay_in_memory(tmp_path: Path) -> None:
-    first, second = (
-        filled(recorder).stop() for recorder in (Recorder(ROBOT), Recorder(ROBOT, tmp_path / "session.csv"))
-    )
+def test_without_a_path_rows_stay_in_memory(tmp_path):
+    first, second = (filled(Recorder(ROBOT, path)).stop() for path in (None, tmp_path / "session.csv"))
     assert_same(first, second)
     assert first.name == "session"
 
 
-def test_no_file_is_overwritten_unasked(tmp_path: Path) -> None:
+def test_no_file_is_overwritten_unrequested(tmp_path):
     path = tmp_path / "session.csv"
     assert free_path(path) == path
     filled(Recorder(ROBOT, path), n=2).stop()
@@ -530,50 +448,40 @@ def test_no_file_is_overwritten_unasked(tmp_path: Path) -> None:
     ("name", "sentence"),
     [("a.txt", "does not end in .csv or .parquet"), ("none/a.csv", "is not there; make it")],
 )
-def test_a_path_that_cannot_be_one_is_refused(tmp_path: Path, name: str, sentence: str) -> None:
+def test_a_path_that_cannot_be_one_is_refused(tmp_path, name, sentence):
     with pytest.raises(InputError, match=sentence):
         Recorder(ROBOT, tmp_path / name)
 
 
-def test_times_never_run_back_and_no_reading_counts_twice() -> None:
-    rng = np.random.default_rng(5)
+def test_times_never_run_back_and_no_reading_counts_twice():
     recorder = Recorder(ROBOT)
     recorder.start(1.0)
-    assert not recorder.add(reading(0.9, rng))  # the robot's newest reading, from before the start
-    assert recorder.add(reading(1.1, rng))
-    assert not recorder.add(reading(1.1, rng))
+    # the robot's newest reading, from before the start, and the same reading twice
+    assert [recorder.add(measured(t)) for t in (0.9, 1.1, 1.1)] == [False, True, False]
     with pytest.raises(InputError, match="clock ran back"):
-        recorder.add(reading(1.05, rng))
+        recorder.add(measured(1.05))
     assert recorder.stop().t.tolist() == [1.1 - 1.0]
 
 
-def test_wrong_use_is_said_in_a_sentence(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
+def test_wrong_use_is_said_in_a_sentence(tmp_path):
     recorder = Recorder(ROBOT, tmp_path / "a.csv")
     with pytest.raises(InputError, match="start first"):
         recorder.stop()
     with pytest.raises(InputError, match="start first"):
-        recorder.add(reading(0.0, rng))
+        recorder.add(measured(0.0))
     recorder.start(0.0, "one")
-    with pytest.raises(InputError, match="'one' is recorded already"):
-        recorder.start(0.0, "one")
-    with pytest.raises(InputError, match="one line"):
-        recorder.start(0.0, "a\nb")
-    with pytest.raises(
-        InputError, match=r"dl of the reading has shape \(8,\); robot 'prototype' needs \(4,\)"
-    ):
-        recorder.add(
-            Measurement(
-                t=0,
-                dl=np.zeros(8),
-                ext=[0],
-                tip_position=np.zeros(3),
-                tip_quaternion=[1, 0, 0, 0],
-                tension=np.zeros(8),
-            )
-        )
-    with pytest.raises(InputError, match=r"tip_force of the reading has shape \(2,\)"):
-        recorder.add(reading(0.0, rng), tip_force=(0.0, 0.0))
-    with pytest.raises(InputError, match="no reading came in"):
-        recorder.stop()
+    eight = measured(0, dl=np.zeros(8), tension=np.zeros(8), tip_position=np.zeros(3))
+    wrong = [
+        (lambda: recorder.start(0.0, "one"), "'one' is recorded already"),
+        (lambda: recorder.start(0.0, "a\nb"), "one line"),
+        (lambda: recorder.add(eight), r"dl of the reading has shape \(8,\); robot 'prototype' needs \(4,\)"),
+        (
+            lambda: recorder.add(measured(0.0), tip_force=(0.0, 0.0)),
+            r"tip_force of the reading has shape \(2,\)",
+        ),
+        (recorder.stop, "no reading came in"),
+    ]
+    for call, sentence in wrong:
+        with pytest.raises(InputError, match=sentence):
+            call()
     assert list(tmp_path.iterdir()) == []

@@ -15,15 +15,12 @@ from rods import bend, rod
 
 from fastrod import Observer, Problem, Robot, Simulator, State, load_robot
 from fastrod.contact import ContactScene, plane
-from fastrod.errors import InputError, ProblemSentence
+from fastrod.errors import ProblemSentence
 from fastrod.solver.recovery import pressed
 
 N, ROWS, OTHERS = 4, np.array([1, 3]), np.array([0, 2])
 REACHER = load_robot("five_segment_reacher")
-LASH: tuple[dict[str, Any], ...] = (
-    {"name": "backlash", "half_width": 3e-4},
-    {"name": "gravity", "line_density": 0.02},
-)
+LASH = {"name": "backlash", "half_width": 3e-4}, {"name": "gravity", "line_density": 0.02}
 FAR = ContactScene(obstacles=[plane(point=(0, 0, -5.0), normal=(0, 0, 1), name="floor")], rod_radius=0.005)
 FIELDS = ("position", "rotation", "tip_position", "tension", "base_wrench", "residual", "ok", "passes")
 
@@ -176,41 +173,6 @@ def test_gravity_of_a_step_is_that_of_the_weight_and_the_payload() -> None:
         assert np.abs(each.position[0] - earth[0]).max() > 1e-5
 
 
-MASKED = np.ma.array(REACHER.rest_tendon_length, mask=[True] + 14 * [False])
-REST = REACHER.rest_tendon_length
-FORCE = np.ma.array([0.0, 0.0, 0.1], mask=[False, False, True])
-
-
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (
-            lambda _: Simulator(REACHER, 10**12),
-            r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB",
-        ),
-        (lambda _: Simulator(REACHER, 10**30), "would take"),
-        (lambda _: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
-        (lambda _: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
-        (lambda _: Simulator(REACHER, 2, points_per_segment=10**30), "would take"),
-        (lambda sim: sim.restore("x"), r"^the snapshot is 'x'; give what Simulator.snapshot\(\) returned"),
-        (lambda sim: sim.step(dt=0.1), r"^step has no input 'dt'; the time step is given once: Simulator\("),
-        (lambda sim: sim.settle(tip_forc=(0, 0, 1)), "^settle has no input 'tip_forc'; did you mean"),
-        (lambda sim: sim.step(MASKED), "^tendon_length is a masked array that hides 1 of 15 entries"),
-        (lambda sim: sim.step([MASKED]), "tendon_length is a masked array"),
-        (lambda sim: sim.step(REST, tip_force=FORCE), "tip_force is a masked array"),
-        (lambda sim: sim.step(REST, point_force=[(0.1, FORCE)]), "point_force is a masked array"),
-        (lambda sim: sim.step(REST, point_force=[(np.ma.array([0.1], mask=[1]), (0, 0, 1))]), "arclength"),
-        (lambda sim: sim.step(REST, gravity=FORCE), "gravity is a masked array"),
-        (lambda sim: sim.step(REST, gravity=9.81), r"gravity has shape \(\); it must be"),
-        (lambda sim: sim.settle(REST, rows=np.ma.array([0], mask=[True])), "rows is a masked array"),
-    ],
-)
-def test_what_cannot_be_is_one_sentence(call: Callable[[Simulator], object], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as caught:
-        call(Simulator(REACHER))
-    assert "\n" not in str(caught.value)
-
-
 def test_an_unmasked_masked_array_is_an_array() -> None:
     sim = Simulator(REACHER)
     assert sim.settle(np.ma.array(REACHER.rest_tendon_length)).ok.all()
@@ -301,12 +263,6 @@ def test_each_problem_has_a_kind() -> None:
     assert sim.settle(rest).problem_kinds == {}
     sim.restore(snapshot, [1])
     assert sim.state.problem_kinds == {1: Problem.BAD_INPUT}
-
-
-def test_the_old_name_of_an_option_says_the_new_one() -> None:
-    old: dict[str, Any] = {"hold_gain": 1e-4}
-    with pytest.raises(InputError, match=r"^the option 'hold_gain' is now 'kept_jacobian_tolerance'\.$"):
-        Simulator(REACHER, **old)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from truth import plant
 
-from fastrod.errors import InputError, LogError
+from fastrod.errors import LogError
 from fastrod.identification.log.inputs import inputs, tendon_length
 from fastrod.identification.log.replay import DENSE, Replay, draw, replay, table, write
 from fastrod.logs.runlog import RunLog, read_log, write_log
@@ -36,8 +36,6 @@ def shipped_log() -> RunLog:
     from fastrod.identification.excite import excitation
 
     log = excitation(load_robot("prototype")).log
-    assert log.payload is not None
-    assert log.base_quaternion is not None
     inputs = plant.Inputs(log.t, log.dl, log.payload, log.base_quaternion)
     tip = plant.measure(inputs, plant.draw(DEMO_SEED, "friction"), noise=3e-4)
     return changed(log, t=np.round(log.t, 4), dl=np.round(log.dl, 7), tip_position=np.round(tip, 6))
@@ -46,16 +44,13 @@ def shipped_log() -> RunLog:
 def other_robot() -> Robot:
     """A prototype that is a little different from the shipped one."""
     robot = load_robot("prototype")
-    tendons = tuple(
-        changed(tendon, offset=0.0078, angle=float(tendon.angle) + math.radians(2.0))
-        for tendon in robot.tendons
-    )
+    two = math.radians(2.0)
+    tendons = tuple(changed(t, offset=0.0078, angle=float(t.angle) + two) for t in robot.tendons)
     return changed(robot, segments=(changed(robot.segments[0], length=0.0706, tendons=tendons),))
 
 
 def log_of_the_other(n: int = 8) -> RunLog:
-    """What shooting makes of `other_robot`, without noise: two runs along a spiral of bends, the second one
-    under a known load."""
+    """What shooting makes of `other_robot`: two runs along a spiral of bends, the second one under a load."""
     from fastrod.reference import shoot
 
     fraction = np.tile(np.arange(1, n + 1) / n, 2)
@@ -64,23 +59,14 @@ def log_of_the_other(n: int = 8) -> RunLog:
     places = np.array([tendon.position(1)[0] for tendon in nominal.tendons])
     dl = -np.stack([bend * np.cos(turn), bend * np.sin(turn)], axis=1) @ places.T
     force = np.where(np.arange(2 * n)[:, None] < n, 0.0, (0.1, -0.05, 0.05))
-    tips = [
-        shoot(real, real.rest_tendon_length + d, tip_force=f).tip_position
-        for d, f in zip(dl, force, strict=True)
-    ]
-    return RunLog(
-        name="other",
-        t=8.0 * fraction,
-        run=np.repeat(["free", "loaded"], n),
-        dl=dl,
-        tip_position=np.array(tips),
-        tip_force=force,
-    )
+    rest, pairs = real.rest_tendon_length, zip(dl, force, strict=True)
+    tip = np.array([shoot(real, rest + d, tip_force=f).tip_position for d, f in pairs])
+    run = np.repeat(["free", "loaded"], n)
+    return RunLog(name="other", t=8.0 * fraction, run=run, dl=dl, tip_position=tip, tip_force=force)
 
 
 class Arc:
-    """A stand-in for the simulator: constant curvature of a one-segment robot, no loads; it remembers its
-    inputs."""
+    """A stand-in for the simulator: constant curvature, no loads; it remembers its inputs."""
 
     seen: dict[str, Any]
     refuse: tuple[int, ...] = ()
@@ -96,9 +82,8 @@ class Arc:
             places = np.array([tendon.position(1)[0] for tendon in self.robot.tendons])
             bend = -(given["tendon_length"] - self.robot.rest_tendon_length) @ np.linalg.pinv(places).T
             angle = np.linalg.norm(bend, axis=1)[:, None] + 1e-12
-            tip = self.robot.length * np.hstack(
-                [bend / angle * (1.0 - np.cos(angle)) / angle, np.sin(angle) / angle]
-            )
+            aside = bend / angle * (1.0 - np.cos(angle)) / angle
+            tip = self.robot.length * np.hstack([aside, np.sin(angle) / angle])
         ok = np.ones(self.n_robots, dtype=bool)
         ok[[row for row in self.refuse if row < self.n_robots]] = False
         return SimpleNamespace(tip_position=tip, ok=ok)
@@ -106,16 +91,8 @@ class Arc:
 
 def small_log(n: int = 6, **more: Any) -> RunLog:
     dl = np.outer(np.linspace(-1.0, 1.0, n), (0.002, 0.0, -0.002, 0.0))
-    tip = np.zeros((n, 3))
-    tip[:, 2] = 0.07
-    return RunLog(
-        name="small",
-        t=np.arange(n) / 10.0,
-        run=np.repeat(["a", "b"], n // 2),
-        dl=dl,
-        tip_position=tip,
-        **more,
-    )
+    t, run, tip = np.arange(n) / 10.0, np.repeat(["a", "b"], n // 2), np.tile((0.0, 0.0, 0.07), (n, 1))
+    return RunLog(name="small", t=t, run=run, dl=dl, tip_position=tip, **more)
 
 
 @pytest.fixture
@@ -157,18 +134,9 @@ def test_rows_that_miss_or_fail_are_left_out(prototype: Robot) -> None:
 
 def test_tendon_lengths_count_from_the_straight_rest_robot_whatever_the_extension() -> None:
     robot = load_robot("five_segment_reacher")
-    ext = np.array([[0.0, 0.0, 0.0, 0.0, 0.02]])
-    log = RunLog(
-        name="x",
-        t=np.zeros(1),
-        run=np.array([""]),
-        dl=np.full((1, 15), -0.001),
-        tip_position=np.zeros((1, 3)),
-        ext=ext,
-    )
-    lengths = tendon_length(log, robot)
-    assert lengths is not None
-    assert_allclose(lengths[0] - robot.rest_tendon_length, -0.001)
+    more = {"tip_position": np.zeros((1, 3)), "ext": np.array([[0.0, 0.0, 0.0, 0.0, 0.02]])}
+    log = RunLog(name="x", t=np.zeros(1), run=np.array([""]), dl=np.full((1, 15), -0.001), **more)
+    assert_allclose(tendon_length(log, robot)[0] - robot.rest_tendon_length, -0.001)
 
 
 def test_loads_turn_with_the_base_and_weight_does_not(prototype: Robot) -> None:
@@ -192,27 +160,15 @@ def test_prediction_is_given_in_the_base_frame(prototype: Robot) -> None:
     assert_allclose(replay(small_log(), hung, simulator=World).tip_position, upright.tip_position, atol=1e-15)
 
 
-def test_tension_robot_is_refused(prototype: Robot) -> None:
-    tense = changed(prototype, segments=(changed(prototype.segments[0], mode="tendon_tension"),))
-    with pytest.raises(InputError, match="mode 'tendon_tension', but a run log gives tendon lengths"):
-        replay(small_log(), tense, simulator=Arc)
-
-
 def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
-    result = replay(small_log(), prototype, simulator=Arc)
-    paths = write(result, tmp_path / "deep" / "out")
-    assert (
-        sorted(p.name for p in (tmp_path / "deep" / "out").iterdir())
-        == ["replay.png", "residuals.csv"]
-        == sorted(p.name for p in paths)
-    )
-    rows = list(csv.DictReader((tmp_path / "deep" / "out" / "residuals.csv").read_text().splitlines()))
+    result, out = replay(small_log(), prototype, simulator=Arc), tmp_path / "deep" / "out"
+    paths = write(result, out)
+    assert sorted(out.iterdir()) == sorted(paths) == [out / "replay.png", out / "residuals.csv"]
+    rows = list(csv.DictReader((out / "residuals.csv").read_text().splitlines()))
     assert len(rows) == 6
-    assert float(rows[0]["residual_norm"]) == pytest.approx(
-        float(np.linalg.norm(result.residual[0])), rel=1e-8
-    )
-    assert rows[0]["run"] == "a"
-    assert rows[0]["converged"] == "1"
+    norm = float(np.linalg.norm(result.residual[0]))
+    assert float(rows[0]["residual_norm"]) == pytest.approx(norm, rel=1e-8)
+    assert (rows[0]["run"], rows[0]["converged"]) == ("a", "1")
 
 
 def axes_of(result: Replay) -> list[Any]:
@@ -225,9 +181,8 @@ def axes_of(result: Replay) -> list[Any]:
 def long_log(n: int) -> RunLog:
     """Rows at 10 Hz of a tip that swings 20 mm along x."""
     tip = np.stack([0.02 * np.sin(0.1 * np.arange(n)), np.zeros(n), np.full(n, 0.07)], axis=1)
-    return RunLog(
-        name="long", t=np.arange(n) / 10.0, run=np.full(n, ""), dl=np.zeros((n, 4)), tip_position=tip
-    )
+    t, run = np.arange(n) / 10.0, np.full(n, "")
+    return RunLog(name="long", t=t, run=run, dl=np.zeros((n, 4)), tip_position=tip)
 
 
 def test_picture_leaves_out_what_was_not_measured(prototype: Robot) -> None:
@@ -254,9 +209,9 @@ def test_picture_of_a_dense_log_shows_envelopes_and_points_of_both(prototype: Ro
 
 
 def test_progress_is_told(prototype: Robot) -> None:
-    told: list[tuple[int, int]] = []
-    replay(small_log(), prototype, simulator=Arc, progress=lambda done, total: told.append((done, total)))
-    assert told == [(6, 6)]
+    steps: list[tuple[int, ...]] = []
+    replay(small_log(), prototype, simulator=Arc, progress=lambda *step: steps.append(step))
+    assert steps == [(6, 6)]
 
 
 def test_table_has_a_line_for_each_run_and_for_all(prototype: Robot) -> None:
@@ -264,20 +219,15 @@ def test_table_has_a_line_for_each_run_and_for_all(prototype: Robot) -> None:
 
 
 def test_table_shows_no_excursion_of_a_run_that_stands_still(prototype: Robot) -> None:
-    log = small_log()
-    tip = log.tip_position + np.array([0.0, 0.001, 0.0])
-    tip[3:, 0] += (-0.05, 0.0, 0.05)  # run b moves
-    grid = table(replay(changed(log, dl=np.zeros((6, 4)), tip_position=tip), prototype, simulator=Arc))
-    excursion = list(grid.columns[6].cells)
-    assert excursion[0] == "–"
+    tip = small_log().tip_position + np.array([0.0, 0.001, 0.0])
+    still = changed(small_log(), dl=np.zeros((6, 4)), tip_position=tip)
+    assert "excursion" not in draw(replay(still, prototype, simulator=Arc)).get_suptitle()
+    moving = tip.copy()
+    moving[3:, 0] += (-0.05, 0.0, 0.05)  # run b moves
+    grid = table(replay(changed(still, tip_position=moving), prototype, simulator=Arc))
+    assert next(iter(grid.columns[6].cells)) == "–"
     assert "measured - predicted" in str(grid.caption)
     assert "quasi-static" in str(grid.caption)
-    still = replay(
-        changed(log, dl=np.zeros((6, 4)), tip_position=log.tip_position + np.array([0.0, 0.001, 0.0])),
-        prototype,
-        simulator=Arc,
-    )
-    assert "excursion" not in draw(still).get_suptitle()
 
 
 def test_shipped_log_is_what_the_plant_makes() -> None:
@@ -298,8 +248,7 @@ def test_shipped_log_does_not_say_what_is_in_it() -> None:
 
 
 def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None:
-    """A log by another solver: the robot that it was made on leaves the solvers' steps, with loads and
-    without."""
+    """A log by another solver: the robot that it was made on leaves the solvers' steps alone."""
     log = log_of_the_other()
     nominal = replay(log, load_robot("prototype"))
     assert nominal.converged.all()
@@ -316,23 +265,20 @@ def test_replay_of_the_simulators_own_run_leaves_nothing(
 
     rod = changed(prototype.segments[0], line_density=0.2)
     heavy = changed(prototype, segments=(rod,), base_position=(0.1, 0.2, 0.3), log_points=(0.02, 0.05))
-    log = small_log(
-        8, base_quaternion=np.tile(orientation, (8, 1)), payload=np.full(8, 0.005), points=np.zeros((8, 2, 3))
-    )
+    given = {"base_quaternion": np.tile(orientation, (8, 1)), "payload": np.full(8, 0.005)}
+    log = small_log(8, **given, points=np.zeros((8, 2, 3)))
     first = replay(log, heavy)
     assert first.converged.all()
     assert first.points is not None
     again = replay(changed(log, tip_position=first.tip_position, points=first.points), heavy)
     assert again.rms == 0.0
-    # hanging or standing, the base frame sees gravity turn: the upright and the hung robot differ only
-    # through weight
+    # hanging or standing, the upright and the hung robot differ only through weight
     one = simulator.Simulator(heavy, n_robots=1)
     pose = np.array([[0.0, 0.0, 0.0, *orientation]])
     weight = 0.005 * np.array([[0.0, 0.0, -9.81]])
     state = one.settle(heavy.rest_tendon_length + log.dl[:1], tip_force=weight, base_pose=pose)
-    assert np.linalg.norm(state.tip_position[0]) == pytest.approx(
-        float(np.linalg.norm(first.tip_position[0])), abs=1e-9
-    )
+    far = float(np.linalg.norm(first.tip_position[0]))
+    assert np.linalg.norm(state.tip_position[0]) == pytest.approx(far, abs=1e-9)
 
 
 def test_points_of_the_straight_robot_lie_on_its_axis(prototype: Robot) -> None:

@@ -308,7 +308,7 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
         "tip error, rms [mm]",
         "backlash",
         "half width",
-        "latency cannot be told from dynamics",
+        "latency cannot be distinguished from dynamics",
         "run next: turn <it>",
     ):
         assert word in text, word

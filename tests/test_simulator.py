@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from rods import bend, rod
 
 import fastrod
 from fastrod import Observer, Simulator, load_robot
-from fastrod.errors import InputError, RobotError, UnknownNameError
+from fastrod.errors import InputError
 from fastrod.kernels.rod.columns import step_column
 from fastrod.model.robotfile import dumps, loads
 from fastrod.solver.boundary import BoundarySolver
@@ -61,8 +60,7 @@ def test_hot_loops_are_simd_code() -> None:
 
 
 def test_a_load_that_no_number_of_steps_would_bring_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of
-    several passes."""
+    """Steps are in proportion to one over the load: 10 kN on 2 N mm^2 would take thousands."""
     sim, ran = Simulator(rod(), n_robots=2, points_per_segment=6), 0
     run = BoundarySolver.run
 
@@ -96,9 +94,9 @@ def test_one_bad_robot_leaves_its_neighbours_alone() -> None:
     assert "impossible" in state.problems[11]
     assert np.isnan(state.position[[7, 11]]).all()
     assert_array_equal(state.position[good], clean.position[good])
-    mended = sim.settle(lengths)
-    assert mended.ok.all()
-    assert_allclose(mended.tip_position, clean.tip_position, atol=1e-8)
+    repaired = sim.settle(lengths)
+    assert repaired.ok.all()
+    assert_allclose(repaired.tip_position, clean.tip_position, atol=1e-8)
 
 
 def test_a_diverged_robot_starts_anew_and_nothing_continues_on_nan() -> None:
@@ -166,9 +164,8 @@ def test_a_buffer_that_its_owner_writes_into_is_a_new_input() -> None:
     two.settle(rest, tip_force=force)
     for k in range(1, 6):
         force[:] = [0.0, 0.01 * k, 0.0]
-        assert_array_equal(
-            one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position
-        )
+        expected = two.step(rest, tip_force=force.copy()).position
+        assert_array_equal(one.step(rest, tip_force=force).position, expected)
 
 
 def test_snapshot_restores_every_bit() -> None:
@@ -199,98 +196,11 @@ def test_tip_outputs_keep_little_memory() -> None:
     robot = load_robot("five_segment_reacher")
     sim = Simulator(robot, n_robots=64, points_per_segment=4, outputs="tip")
     state = sim.settle(robot.rest_tendon_length)
-    kept = sum(a.nbytes for a in sim._passes.memory) + state.residual.nbytes + state.ok.nbytes
-    kept += sum(
-        a.nbytes
-        for a in (
-            state.position,
-            state.rotation,
-            state.tension,
-            state.base_wrench,
-            state.tip_position,
-            state.tip_rotation,
-        )
-    )
-    assert kept / 64 <= 2000
+    names = "residual ok position rotation tension base_wrench tip_position tip_rotation"
+    kept = [*sim._passes.memory, *(getattr(state, name) for name in names.split())]
+    assert sum(a.nbytes for a in kept) / 64 <= 2000
     with pytest.raises(InputError, match="outputs='full'"):
         sim.shape([0.1])
-
-
-def test_robots_of_a_batch_may_differ_but_not_in_their_counts() -> None:
-    with pytest.raises(RobotError, match="n_tendons 4, robot 0 has 3"):
-        Simulator([rod(n_tendons=3), rod(n_tendons=4)])
-    with pytest.raises(RobotError, match="modes"):
-        Simulator([rod(), rod("tendon_tension")])
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"tendon_length": np.zeros((3, 4))}, r"shape \(3, 4\); it must be \(2, 4\)"),
-        ({"tendon_length": "abc"}, "not an array of numbers"),
-        ({"tendon_length": [70.0] * 4}, "Was it given in mm"),
-        ({"tendon_length": [0.001, 0.0, -0.001, 0.0]}, "Add Robot.rest_tendon_length"),
-        ({"tendon_length": [np.nan] * 4}, "not finite"),
-        ({"tendon_length": [-0.07] * 4}, "impossible"),
-        ({}, "tendon_length is missing"),
-        ({"tendon_length": [0.07] * 4, "tip_force": [1.0, 2.0]}, r"tip_force has shape \(2,\)"),
-        ({"tendon_length": [0.07] * 4, "extension": [0.01]}, "outside the range"),
-        ({"tendon_length": [0.07] * 4, "point_force": [(0.1, (0, 0, 1))]}, "the rod runs from 0 to 0.07"),
-        ({"tendon_length": [0.07] * 4, "point_force": [0.1, 0.2]}, "pairs"),
-        ({"tendon_length": [0.07] * 4, "base_pose": [0, 0, 0, 1, 1, 0, 0]}, "norm"),
-        ({"tendon_length": [0.07] * 4, "tolerance": 0.0}, "tolerance"),
-        ({"tendon_length": [0.07] * 4, "line_force": np.zeros((2, 5, 3, 2))}, "line_force has shape"),
-        ({"tendon_length": [0.07] * 4, "line_force": "a"}, "not an array of numbers"),
-        ({"tendon_length": [0.07] * 4, "line_force": np.zeros((1, 1, 3))}, "two or more"),
-        ({"tendon_length": [0.07] * 4, "tension": [1.0] * 4}, "no segment of this robot"),
-        ({"tendon_length": [0.07j] * 4}, "not an array of numbers"),
-        ({"tendon_length": [0.07] * 4, "tolerance": "x"}, "must be a number"),
-        ({"tendon_length": [0.07] * 4, "point_force": 0}, "pairs"),
-        ({"tendon_length": [0.07] * 4, "point_force": [("a", (0, 0, 1))]}, "pairs"),
-    ],
-)
-def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) -> None:
-    sim = Simulator(rod(), n_robots=2)
-    with pytest.raises(InputError, match=sentence) as caught:
-        sim.settle(**given)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"n_robots": 0}, "n_robots is 0"),
-        ({"n_robots": 2.5}, "whole number"),
-        ({"n_robots": 10**400}, "take fewer"),
-        ({"points_per_segment": 10**400}, "take fewer"),
-        ({"dt": -1.0}, "dt is -1.0"),
-        ({"points_per_segment": 1}, "at least 2"),
-        ({"outputs": "tips"}, "'full' or 'tip'"),
-        ({"threads": 1000}, "threads is 1000"),
-        ({"threads": 1.5}, "threads is 1.5"),
-        ({"dt": "a"}, "dt is 'a'"),
-        ({"observer": 3}, "observer is 3"),
-    ],
-)
-def test_a_simulator_that_cannot_be(given: dict[str, object], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        Simulator(rod(), **given)
-
-
-@pytest.mark.parametrize("robot", ["prototype", ["prototype"], None, []])
-def test_what_is_not_a_robot(robot: object) -> None:
-    with pytest.raises(RobotError, match="load_robot"):
-        Simulator(robot)
-
-
-def test_queries_before_a_state() -> None:
-    sim = Simulator(rod())
-    for query in (sim.jacobian, sim.compliance, lambda: sim.shape(0.01)):
-        with pytest.raises(InputError, match="call step or settle first"):
-            query()
-    sim.settle(rod().rest_tendon_length)
-    with pytest.raises(InputError, match=r"arclength 0.08 m; robot 0 runs from 0 to 0.07"):
-        sim.shape(0.08)
 
 
 @pytest.mark.parametrize("name", fastrod.robot_names())
@@ -299,61 +209,17 @@ def test_robot_files_survive_a_round_trip(name: str) -> None:
     assert loads(dumps(robot)) == robot
 
 
-SEGMENT = "[[segment]]\nlength = 0.07\nbending_stiffness = [0.002, 0.002]\ntorsional_stiffness = 0.001\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ('name = "a"', "no segments"),
-        (SEGMENT + 'mode = "passive"', "no name"),
-        ('name = "a"\nlenght = 3\n', "unknown key 'lenght'"),
-        ('name = "a"\n' + SEGMENT.replace("length", "lenght"), "did you mean 'length'"),
-        ('name = "a"\n' + SEGMENT.replace("0.07", "70"), "Was it given in mm"),
-        ('name = "a"\n' + SEGMENT.replace("0.07", "-0.07"), "must be positive"),
-        ('name = "a"\n' + SEGMENT.replace("0.07", '"long"'), "length: Expected 'float'"),
-        ('name = "a"\n' + SEGMENT + 'mode = "tendon_lenght"', "tendon_length"),
-        (
-            'name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 0.0, colour = 1}]",
-            "unknown key 'colour'",
-        ),
-        ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 90.0}]", "degrees"),
-        (
-            'name = "a"\n' + SEGMENT + "body_radius = 0.005\ntendons = [{offset = 0.01, angle = 0.0}]",
-            "beyond the body radius",
-        ),
-        ('name = "a"\n' + SEGMENT + "youngs_modulus = 3e5", "all of youngs_modulus"),
-        ('name = "a"\n' + SEGMENT + 'mode = "passive"\n[base]\nquaternion = [1, 1, 0, 0]', "it must be 1"),
-        ("name = ", "not TOML"),
-    ],
-)
-def test_bad_robot_files_get_one_sentence(text: str, sentence: str) -> None:
-    with pytest.raises(RobotError, match=sentence) as caught:
-        loads(text)
-    assert "\n" not in str(caught.value)
-
-
 def test_moduli_stand_for_stiffness() -> None:
-    moduli = (
-        "[[segment]]\nlength = 0.07\nyoungs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = "
-        "7e-9\npolar_moment = 1.4e-8\n"
-    )
-    segment = loads('name = "a"\n' + moduli + 'mode = "passive"').segments[0]
+    moduli = "youngs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = 7e-9\npolar_moment = 1.4e-8\n"
+    text = f'name = "a"\n[[segment]]\nlength = 0.07\n{moduli}mode = "passive"'
+    segment = loads(text).segments[0]
     assert segment.bending_stiffness == pytest.approx((2.1e-3, 2.1e-3))
     assert segment.torsional_stiffness == pytest.approx(9.8e-4)
 
 
 def test_unknown_names_answer_with_the_near_ones() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'prototype'"):
-        load_robot("prototpye")
     with pytest.raises(AttributeError, match="did you mean 'Simulator'"):
         fastrod.Simulater  # noqa: B018
-
-
-def test_mixed_paper_mode_is_refused() -> None:
-    robot = load_robot("tdcr_a")
-    with pytest.raises(RobotError, match="whole robot"):
-        replace(robot, segments=(replace(robot.segments[0], mode="paper"), robot.segments[1]))
 
 
 def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
@@ -369,14 +235,9 @@ def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "FASTROD_CACHE_DIR": str(tmp_path / "cache")}
 
     def folder() -> str:
-        return subprocess.run(
-            [sys.executable, "-c", script],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=tmp_path,
-        ).stdout
+        given = {"env": environment, "cwd": tmp_path}
+        words = [sys.executable, "-c", script]
+        return subprocess.run(words, capture_output=True, text=True, check=True, **given).stdout
 
     seen = [folder()]
     for edited in (copy / "kernels" / "vec.py", copy / "types.py"):
@@ -405,9 +266,8 @@ def test_jacobian_that_comes_with_the_step_is_the_same(n_robots, force):
     for _ in range(3):  # to rest: the plain one is asked at the boundary after the pass
         plain.step(**inputs)
         derived.step(**inputs, derive=True)
-    np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(
-        plain.jacobian(turning=True), derived.jacobian(turning=True), rtol=1e-6, atol=1e-6
-    )
+    for turning in (False, True):
+        a, b = (sim.jacobian(turning=turning) for sim in (plain, derived))
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
     derived.settle(**inputs)
     np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)

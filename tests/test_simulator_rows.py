@@ -1,5 +1,4 @@
-"""Robots of a batch held, put back, settled or replaced one by one: exact for them, and nothing to the
-others."""
+"""Robots of a batch held, put back, settled or replaced one by one: exact, and nothing to the others."""
 
 from __future__ import annotations
 
@@ -20,25 +19,13 @@ from fastrod.errors import InputError, RobotError
 from fastrod.model.segment_actions import SegmentActions
 
 N, ROWS, OTHERS = 5, np.array([1, 3]), np.array([0, 2, 4])
-FIELDS = (
-    "position",
-    "rotation",
-    "curvature",
-    "tip_position",
-    "tip_rotation",
-    "tension",
-    "base_wrench",
-    "residual",
-    "ok",
-    "passes",
-)
+FIELDS = "position rotation curvature tip_position tip_rotation tension base_wrench residual ok passes"
 Inputs = dict[str, Any]
 Step = Callable[[int], Inputs]
 
 
 def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
-    """The five-segment reacher on a slow path: all bends at some 10 mm/s, its last segment extending, as a
-    function of time [s]."""
+    """The five-segment reacher on a slow path of some 10 mm/s, as a function of time [s]."""
     robot = load_robot("five_segment_reacher")
     matrix = SegmentActions(robot).matrix
 
@@ -52,12 +39,14 @@ def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
     return robot, at
 
 
+def keeping(robot: Robot, *tolerances: float) -> list[Simulator]:
+    options = {"dt": 0.05, "points_per_segment": 2, "threads": 1}
+    return [Simulator(robot, **options, kept_jacobian_tolerance=h) for h in tolerances]
+
+
 def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
     robot, at = reacher()
-    fresh, held, still = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
-        for h in (0.0, 5e-5, 0.0)
-    )
+    fresh, held, still = keeping(robot, 0.0, 5e-5, 0.0)
     fresh.settle(**at(0.0))
     held.settle(**at(0.0))
     errors, residuals = [], []
@@ -76,10 +65,7 @@ def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
 
 def test_held_steps_come_to_rest_where_settle_does() -> None:
     robot, at = reacher()
-    sim, still = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
-        for h in (5e-5, 0.0)
-    )
+    sim, still = keeping(robot, 5e-5, 0.0)
     sim.settle(**at(0.0))
     for k in range(1, 60):
         sim.step(**at(0.05 * k))
@@ -91,22 +77,12 @@ def test_held_steps_come_to_rest_where_settle_does() -> None:
 
 def test_a_gain_is_held_only_below_the_residual_that_is_allowed() -> None:
     robot, at = reacher()
-    plain, strict, loose = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
-        for h in (0.0, 1e-30, 1e-3)
-    )
     tips = []
-    for sim in (plain, strict, loose):
+    for sim in keeping(robot, 0.0, 1e-30, 1e-3):
         sim.settle(**at(0.0))
         tips.append([sim.step(**at(0.2 * k)).tip_position[0] for k in range(1, 20)])
     assert_array_equal(tips[1], tips[0])
     assert np.abs(np.array(tips[2]) - tips[0]).max() > 0.0
-
-
-@pytest.mark.parametrize("gain", [-1e-9, np.inf, np.nan, "much", None])
-def test_a_gain_to_hold_must_be_a_length(gain: Any) -> None:
-    with pytest.raises(InputError, match="kept_jacobian_tolerance"):
-        Simulator(rod(), kept_jacobian_tolerance=gain)
 
 
 def backlash() -> Robot:
@@ -115,17 +91,14 @@ def backlash() -> Robot:
 
 def wiggled(robot: Robot, seed: int = 3) -> Step:
     """Tendon lengths (N, n_tendons) of a walk of its own for each of N robots."""
-    rng = np.random.default_rng(seed)
-    walk = np.cumsum(0.06 * rng.normal(size=(40, N, 2)), axis=0)
+    walk = np.cumsum(0.06 * np.random.default_rng(seed).normal(size=(40, N, 2)), axis=0)
     return lambda k: {"tendon_length": np.array([bend(robot, *angles) for angles in walk[k]])}
 
 
 def loaded(step: Step) -> Step:
     """With a tip force on every robot that begins to move at step 4."""
-    push = np.array(
-        [[0.0, 0.02, 0.01], [0.02, 0.0, 0.0], [0.01, 0.01, 0.0], [-0.02, 0.0, 0.01], [0.0, 0.0, 0.02]]
-    )
-    return lambda k: {**step(k), "tip_force": push * max(k - 3, 0)}
+    push = [[0.0, 0.02, 0.01], [0.02, 0.0, 0.0], [0.01, 0.01, 0.0], [-0.02, 0.0, 0.01], [0.0, 0.0, 0.02]]
+    return lambda k: {**step(k), "tip_force": np.multiply(push, max(k - 3, 0))}
 
 
 def walled() -> Step:
@@ -145,30 +118,28 @@ CASES: dict[str, tuple[Robot, Step, ContactScene | None, float]] = {
 }
 
 
+def simulator(robot: Robot | list[Robot], **options: Any) -> Simulator:
+    return Simulator(robot, N, dt=0.02, points_per_segment=8, threads=1, **options)
+
+
 def made(case: str) -> tuple[Simulator, Inputs, Step]:
-    """A simulator at home, its inputs there, and what it is told after."""
+    """A simulator at home, its inputs there, and what it is commanded after."""
     robot, step, contact, hold = CASES[case]
     home = {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim = Simulator(
-        robot, N, dt=0.02, points_per_segment=8, threads=1, contact=contact, kept_jacobian_tolerance=hold
-    )
+    sim = simulator(robot, contact=contact, kept_jacobian_tolerance=hold)
     sim.settle(**home)
     return sim, home, step
 
 
 def same(one: State, other: State, rows: Any = slice(None)) -> bool:
     """Whether these robots agree to the last bit."""
-    return all(
-        np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)
-        for name in FIELDS
-    )
+    pairs = ((getattr(one, name)[rows], getattr(other, name)[rows]) for name in FIELDS.split())
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_robots_put_back_begin_anew_and_the_others_notice_nothing(case: str) -> None:
-    sim, _, step = made(case)
-    alone, _, _ = made(case)
-    fresh, _, _ = made(case)
+    (sim, _, step), (alone, _, _), (fresh, _, _) = made(case), made(case), made(case)
     snapshot, at_home = sim.snapshot(), sim.state
     for k in range(8):
         assert same(sim.step(**step(k)), alone.step(**step(k)))
@@ -190,7 +161,7 @@ def test_contact_and_backlash_matter_in_these_cases() -> None:
     assert (touched[:8] > 0).any(0)[ROWS].all()
     assert (touched[8:] > 0).any(0)[ROWS].all()
     lash, _, step = made("effect with memory")
-    free = Simulator(replace(backlash(), effects=()), N, dt=0.02, points_per_segment=8, threads=1)
+    free = simulator(replace(backlash(), effects=()))
     for k in range(8):
         tips = lash.step(**step(k)).tip_position, free.step(**step(k)).tip_position
     assert np.abs(tips[0] - tips[1]).max() > 1e-4
@@ -268,9 +239,8 @@ def test_some_robots_settle_and_the_others_stay(case: str) -> None:
     assert (sim.state.residual[ROWS] < 1e-9).all()
     assert sim.state.ok.all()
     if case != "effect with memory":  # where a robot settles depends on where its tendons were
-        assert_allclose(
-            sim.state.tip_position[ROWS], fresh.settle(**step(20)).tip_position[ROWS], rtol=0, atol=1e-8
-        )
+        expected = fresh.settle(**step(20)).tip_position[ROWS]
+        assert_allclose(sim.state.tip_position[ROWS], expected, rtol=0, atol=1e-8)
     for k in range(6, 14):
         assert same(sim.step(**step(k)), alone.step(**step(k)), OTHERS)
 
@@ -287,11 +257,7 @@ def test_replaced_robots_are_those_of_a_simulator_built_from_them(robot: Robot) 
         others[1] = replace(others[1], effects=({"name": "backlash", "half_width": 1e-4},))
     listed = [robot, others[0], robot, others[1], robot]
     step, home = wiggled(rod()), {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim = Simulator(robot, N, dt=0.02, points_per_segment=8, threads=1)
-    alone, built = (
-        Simulator(robot, N, dt=0.02, points_per_segment=8, threads=1),
-        Simulator(listed, dt=0.02, points_per_segment=8, threads=1),
-    )
+    sim, alone, built = simulator(robot), simulator(robot), simulator(listed)
     for s in (sim, alone, built):
         s.settle(**home)
     for k in range(6):

@@ -1,7 +1,4 @@
-"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange, at rest, hanging and
-pushed."""
-
-from __future__ import annotations
+"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -68,30 +65,18 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
     contact_bodies: list[Any] = []
     if case in CASES[2:]:
         shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=list(HALF))
-        still = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
-        block = world.createMultiBody(
-            0.0,
-            -1,
-            -1,
-            block_at().tolist(),
-            linkMasses=[MASS if case == CASES[3] else 0.0],
-            linkCollisionShapeIndices=[shape],
-            linkVisualShapeIndices=[-1],
-            linkPositions=[still[0]],
-            linkOrientations=[still[1]],
-            linkInertialFramePositions=[still[0]],
-            linkInertialFrameOrientations=[still[1]],
-            linkParentIndices=[0],
-            linkJointAxis=[[0, 1, 0]],
-            linkJointTypes=[world.JOINT_PRISMATIC if case == CASES[3] else world.JOINT_FIXED],
-        )
+        sprung = case == CASES[3]
+        zero, level = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]
+        link = {"linkPositions": zero, "linkInertialFramePositions": zero}
+        link |= {"linkOrientations": level, "linkInertialFrameOrientations": level}
+        link |= {"linkMasses": [MASS if sprung else 0.0], "linkParentIndices": [0]}
+        link |= {"linkCollisionShapeIndices": [shape], "linkVisualShapeIndices": [-1]}
+        link |= {"linkJointTypes": [world.JOINT_PRISMATIC if sprung else world.JOINT_FIXED]}
+        link |= {"linkJointAxis": [[0, 1, 0]]}
+        block = world.createMultiBody(0.0, -1, -1, block_at().tolist(), **link)
         contact_bodies = [(block, 0)]
-    rod = MountedRod(
-        carried()[0],
-        BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER)),
-        contact_bodies=contact_bodies,
-        friction=0.0,
-    )
+    base = BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER))
+    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0)
     given = inputs(case)
     if case == CASES[3]:
         world.setJointMotorControl2(block, 0, world.VELOCITY_CONTROL, force=0.0)
@@ -118,9 +103,8 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     if case in CASES[2:]:
         block = spec.worldbody.add_body(name="block", pos=block_at().tolist(), gravcomp=1.0)
         if case == CASES[3]:
-            block.add_joint(
-                type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], stiffness=SPRING, damping=DAMPER
-            )
+            slide = mujoco.mjtJoint.mjJNT_SLIDE
+            block.add_joint(type=slide, axis=[0, 1, 0], stiffness=SPRING, damping=DAMPER)
         block.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=list(HALF), mass=MASS)
         contact_bodies = ["block"]
     robot = carried()[0]
@@ -128,9 +112,8 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     model = spec.compile()
     data = mujoco.MjData(model)
     MujocoArm(model, data).place(JOINTS)
-    rod = MujocoRod(
-        robot, model, data, "tool0", position=(0.0, 0.0, ADAPTER), contact_bodies=contact_bodies, friction=0.0
-    )
+    mount = {"position": (0.0, 0.0, ADAPTER), "contact_bodies": contact_bodies, "friction": 0.0}
+    rod = MujocoRod(robot, model, data, "tool0", **mount)
     given = inputs(case)
     return rod, lambda: rod.step(**given)
 

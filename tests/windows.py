@@ -1,10 +1,10 @@
 """`Window`: one page of the viewer in a browser, as a person uses it."""
 
-from __future__ import annotations
-
 import io
+import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
@@ -57,14 +57,6 @@ class Window:
         self.page.goto(address)
         self.page.wait_for_selector("canvas")
 
-    def close_toast(self) -> None:
-        """Close the note that the page is drawn in software, which covers a corner of the picture."""
-        toast = self.page.locator(".mantine-Notification-closeButton")
-        try:
-            toast.first.click(timeout=8_000)
-        except Exception:  # a browser with a graphics card shows none
-            return
-
     def until(self, holds: Callable[[], bool], seconds: float = PATIENCE) -> bool:
         """Wait until something holds; whether it does."""
         end = time.monotonic() + seconds
@@ -76,6 +68,37 @@ class Window:
         """The thumb of a slider, by its label."""
         row = self.page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//*[@role='slider']][1]")
         return row.locator("[role=slider]").first
+
+    def slide(self, label: str, key: str, times: int = 1) -> Any:
+        """Press a key on a slider; its thumb."""
+        thumb = self.slider(label)
+        thumb.focus()
+        for _ in range(times):
+            thumb.press(key)
+        return thumb
+
+    def button(self, name: str) -> Any:
+        """A button, by its whole name."""
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def shows(self, words: str | re.Pattern[str], once: bool = False) -> bool:
+        """Wait until the page has these words, in one place alone if `once`; whether it does."""
+        found = self.page.get_by_text(words)
+        return self.until(lambda: found.count() == 1 if once else found.count() > 0)
+
+    def tab(self, name: str) -> None:
+        """Choose a tab of the controls."""
+        self.page.get_by_role("tab", name=name).click()
+
+    def save(self, name: str, path: Path) -> None:
+        """Press a button that has a file downloaded."""
+        with self.page.expect_download() as waiting:
+            self.page.get_by_role("button", name=name).click()
+        waiting.value.save_as(path)
+
+    def changed(self, before: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """(height, width) pixels that differ clearly from those before."""
+        return np.abs(self.pixels().astype(int) - before).max(axis=2) > 40
 
     def pick(self, label: str, option: str) -> None:
         """Choose an option of a dropdown."""

@@ -1,4 +1,4 @@
-"""What a drive is told once, by SDO, before it moves: who it is, its limits, its process data."""
+"""What a drive is configured with once, by SDO, before it moves: who it is, its limits, its process data."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ OFF, STOP, RUN, START, RESET = 0x0000, 0x0002, 0x000F, 0x001F, 0x0080
 """Controlwords: no voltage, quick stop, operation, operation with bit 4 (a move begins), fault reset."""
 _WAITED = 0.6  # of a cycle that is waited for answers
 _STEPPED_WAIT = 3.0  # s, the same where time is stepped
-# s; beyond it the drives may have stopped by themselves, and must not be told to go on
+# s; beyond it the drives may have stopped by themselves, and must not be commanded to go on
 _PAUSE = 0.8 * PATIENCE
 _COMMAND = struct.Struct("<Hi")
 
@@ -157,8 +157,8 @@ class Cycle:
         self.configured[i], self.enabled[i], self.words[i] = False, False, OFF
 
     def _let_go(self, now: DriveFeedback) -> None:
-        """A drive that stopped by itself, or may have because the bus failed, is told to stay stopped when it
-        hears us again."""
+        """A drive that stopped by itself, or may have because the bus failed, is commanded to stay stopped
+        when it hears us again."""
         deaf = {e.drive for e in now.emergencies if e.code >> 8 == 0x81}
         for i, word in enumerate(now.statusword):
             if self.enabled[i] and (

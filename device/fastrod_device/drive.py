@@ -53,9 +53,9 @@ class DriveBus:
     belong to one thread; `quick_stop` may come from any. SDO is used in calls that set up, never in
     `exchange`.
 
-    A drive that left "operation enabled" by itself, or was not heard for 0.1 s, is told to stay stopped until
-    `enable`. When the controller paused for so long that the drives stopped by themselves, all are told to
-    stay stopped (`stop_reason`).
+    A drive that left "operation enabled" by itself, or was not heard for 0.1 s, is commanded to stay stopped
+    until `enable`. When the controller paused for so long that the drives stopped by themselves, all are
+    commanded to stay stopped (`stop_reason`).
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class DriveBus:
 
     @property
     def stop_reason(self) -> str:
-        """Why the drives are told to stay stopped; empty while they are not."""
+        """Why the drives are commanded to stay stopped; empty while they are not."""
         return self._cycle.reason if self._cycle.stopping else ""
 
     @property

@@ -34,7 +34,7 @@ from fastrod_device.units import Transmission
 ZERO_SD = 2e-5
 """How sure the tendons' zeros are, homed by camera: 0.1 mm at the tip, a fifth of it in the tendons [m]."""
 _TIGHTENED = 6.0  # s in which the tendons come to one tension
-_YIELD = 0.03  # of what would mend the tensions, in a cycle
+_YIELD = 0.03  # of what would correct the tensions, in a cycle
 _STIFFEST = 1e-4  # m/N that a tendon is taken to give at least
 _SMOOTH = 0.2  # of what the motors' torque says in a cycle
 _UNEVEN = 0.3  # of the pretension
@@ -54,9 +54,9 @@ def home(
     """Do it; tendons as drives with their zero, and the robot with the tensions that its tendons have there.
 
     `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone
-    decides. Raises `DeviceError`, with the drives stopped, where one of them does not do as it is told, a
-    tendon does not come to its pretension or pulls far more, the marker is not seen, or it is seen where the
-    robot cannot be.
+    decides. Raises `DeviceError`, with the drives stopped, where one of them does not do as it is commanded,
+    a tendon does not come to its pretension or pulls far more, the marker is not seen, or it is seen where
+    the robot cannot be.
     """
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
     per = 1.0 / np.abs(transmission.wound(np.ones(n, dtype=np.int64)))  # counts in a metre
@@ -109,7 +109,8 @@ def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) 
     """What is wrong with drives that are homed: one sentence without its full stop, of the first that is
     found; empty where all is well.
 
-    `speed` of the quickest tendon [m/s]: a drive that moves may be further behind where it was told to be.
+    `speed` of the quickest tendon [m/s]: a drive that moves may be further behind where it was commanded to
+    be.
     """
     nodes = [spec.node for spec in hardware.drives]
     if feedback.lost:
@@ -139,7 +140,7 @@ def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) 
                 f"0x{int(feedback.statusword[k]):04X})"
             )
     k, b = int(np.abs(tension).argmax()), int(behind.argmax())
-    slow = f"the drive at node {nodes[b]} is {1e3 * behind[b]:.2g} mm from where it was told to be"
+    slow = f"the drive at node {nodes[b]} is {1e3 * behind[b]:.2g} mm from where it was commanded to be"
     if behind[b] > late:
         return f"{slow}; {1e3 * late:.2g} mm are allowed"
     if abs(tension[k]) > most:

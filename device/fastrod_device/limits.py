@@ -51,7 +51,7 @@ class Limits:
     cycle: float = 0.05
     """Longest gap between two control cycles [s]."""
     following_error: float = 0.001
-    """Largest difference of where a drive was told to be and where it is, as tendon [m]."""
+    """Largest difference of where a drive was commanded to be and where it is, as tendon [m]."""
     encoder_jump: float = 0.0005
     """Largest change of a tendon's length between two samples beyond what `rate` explains [m]."""
     clock_jump: float = 0.2
@@ -86,8 +86,8 @@ def limited(previous: Floats, wanted: Floats, rate: float, dt: float) -> Floats:
     """Tendon lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no tendon
     faster than `rate` [m/s].
 
-    All tendons are scaled alike, so that the robot goes straight to where it was told, and a way between two
-    shapes within the limits stays within them. Raises `InputError` for figures that are not finite or run
+    All tendons are scaled alike, so that the robot goes straight to where it was commanded, and a way between
+    two shapes within the limits stays within them. Raises `InputError` for figures that are not finite or run
     back.
 
     >>> limited(np.zeros(2), np.array([0.004, -0.002]), 0.03, 0.1)

@@ -1,4 +1,4 @@
-"""An emulated drive with its motor: the states of CiA 402, and a shaft that follows what it is told."""
+"""An emulated drive with its motor: the states of CiA 402, and a shaft that follows what it is commanded."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Motor:
         self.torque = 0.0
         """That holds the tendon, [thousandths of the rated torque]."""
         self.noise = 0.0
-        """Of the torque that is told."""
+        """Of the torque that is commanded."""
         self.blocked = False
         self.lasting = 0
         """Code of a fault whose cause is not gone, or 0."""
@@ -127,7 +127,7 @@ class Motor:
         """Object 0x60F4 [counts]."""
         return _int32(round(self.command - self.measured)) if self.powered else 0
 
-    # what it is told
+    # what it is commanded
 
     def written(self, key: Key, value: int) -> None:
         """An object is about to be written. Raises an SDO abort for what cannot be."""

@@ -300,7 +300,7 @@ class EmulatedDrives:
                     node.map()
                 else:
                     node.motor.quick_stop()
-                node.beat_due = min(node.beat_due, self._clock.now())  # the new state is told at once
+                node.beat_due = min(node.beat_due, self._clock.now())  # the new state is reported at once
 
     def _on_process_data(self, cob_id: int, data: bytes) -> None:
         for node in self._nodes:

@@ -67,7 +67,7 @@ class Readings:
     current: Floats
     """(n_drives,) of the motors [A]."""
     following_error: Floats
-    """(n_drives,) told minus done [m]."""
+    """(n_drives,) commanded minus done [m]."""
     statusword: Ints
     """(n_drives,) object 0x6041."""
     age: Floats

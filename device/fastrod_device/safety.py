@@ -73,7 +73,7 @@ and it leads to OFF."""
 
 @final
 class Supervisor:
-    """Stands between whoever commands and the bus. It does no input or output and keeps no time: it is told
+    """Stands between whoever commands and the bus. It does no input or output and keeps no time: it is given
     both. For any thread.
 
     A stop is a value of its own, the list of faults: the robot is STOPPED for as long as it is not empty,
@@ -387,19 +387,19 @@ class Supervisor:
             )
         if not np.isfinite(wanted).all():
             k = int(np.argmin(np.isfinite(wanted)))
-            raise RefusedError(f"tendon {k + 1} was told {wanted[k]} m; it must be a finite number.")
+            raise RefusedError(f"tendon {k + 1} was commanded {wanted[k]} m; it must be a finite number.")
         k = int(np.argmax(np.abs(wanted)))
         if abs(wanted[k]) > self.limits.displacement:
             given, limit = 1e3 * wanted[k], 1e3 * self.limits.displacement
             raise RefusedError(
-                f"tendon {k + 1} was told {given:.6g} mm; this robot's limit is {limit:.6g} mm."
+                f"tendon {k + 1} was commanded {given:.6g} mm; this robot's limit is {limit:.6g} mm."
             )
         curvature = np.linalg.norm(self._routing.bend(wanted), axis=-1) / self._routing.length
         k = int(np.argmax(curvature))
         if curvature[k] > self.limits.curvature:
             needed, most = curvature[k], self.limits.curvature
             raise RefusedError(
-                f"segment {k + 1} was told to bend with {needed:.6g} 1/m; this robot's limit "
+                f"segment {k + 1} was commanded to bend with {needed:.6g} 1/m; this robot's limit "
                 f"is {most:.6g} 1/m."
             )
         return wanted

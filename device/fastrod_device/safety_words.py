@@ -1,4 +1,5 @@
-"""What can be wrong with a robot on the bench: the kinds, and how each is found and told in one sentence."""
+"""What can be wrong with a robot on the bench: the kinds, and how each is found and reported in one
+sentence."""
 
 from __future__ import annotations
 
@@ -224,7 +225,7 @@ class Inspector:
         )
         if before is not None:
             yield from self._jump(now, readings, before)
-        error = "is {} from where it was told to be"
+        error = "is {} from where it was commanded to be"
         yield from self._beyond(
             "following error", readings.following_error, limits.following_error, error, "mm", now
         )

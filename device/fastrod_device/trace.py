@@ -12,7 +12,7 @@ from fastrod.types import Floats
 
 @final
 class Trace:
-    """What encoders said and what was told, of the newest cycles. Its caller has a lock."""
+    """What encoders said and what was commanded, of the newest cycles. Its caller has a lock."""
 
     def __init__(self, n_tendons: int, n_cycles: int) -> None:
         """Empty."""

@@ -219,8 +219,8 @@ class MarkerTracker:
         targets = self._targets(sides)
         fine = self._refine(orientation, shift, targets)
         if len(orientation) > 1 and np.linalg.norm(fine[0][0] - fine[0][1]) < 0.01:
-            # both went to one minimum: the other solution is none of its own. It is told as it was, and never
-            # taken
+            # both went to one minimum: the other solution is none of its own. It is reported as it was, and
+            # never taken
             return (
                 np.stack([fine[0][0], orientation[1]]),
                 np.stack([fine[1][0], shift[1]]),

@@ -61,7 +61,7 @@ def _check_extent(where: str, extent: float, remedy: str) -> None:
     if extent > _LARGEST:
         raise InputError(
             f"{where} is {extent:.6g} m wide; more than {_LARGEST:g} m. Was it given in mm? "
-            f"{remedy}=0.001 mends that."
+            f"{remedy}=0.001 fixes that."
         )
     if extent < _SMALLEST:
         raise InputError(
@@ -352,7 +352,7 @@ def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
             break
         if len(flat) > _MOST_SLIVERS:
             raise InputError(
-                f"{where} has {len(flat)} faces without area, of {len(faces)}; mend it first, "
+                f"{where} has {len(flat)} faces without area, of {len(faces)}; fix it first, "
                 "in the program that made it."
             )
         keys = faces.ravel() * n + np.roll(faces, -1, axis=1).ravel()  # one for each directed edge
@@ -403,7 +403,7 @@ def _check_surface(where: str, vertices: Floats, faces: Ints, open_surface: bool
     turned = int(((count == 2) & (net > 0)).sum())
     if turned:
         raise InputError(
-            f"{where} has {turned} edges whose two faces wind in opposite ways; mend it, e.g. "
+            f"{where} has {turned} edges whose two faces wind in opposite ways; fix it, e.g. "
             "by trimesh.repair.fix_winding."
         )
     n_open = int((count == 1).sum())

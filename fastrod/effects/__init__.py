@@ -1,2 +1,2 @@
-"""Physical effects: what one is (`base`), where it acts (`ports`), all those of a robot (`pipeline`), and the
-laws."""
+"""Physical effects: what one is (`base`), where it acts (`ports`), what runs them (`executor`), all those of
+a robot (`pipeline`), and the laws."""

@@ -4,39 +4,19 @@ measurement sees."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from fastrod.effects.base import Effect, Seam, canonical_name, effect_names, get_effect, read_values
+from fastrod.effects import executor
+from fastrod.effects.base import canonical_name, effect_names, read_values
+from fastrod.effects.executor import Link, SensedPoses
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Params, Ports
-
-
-class SensedPoses(NamedTuple):
-    """What a camera on the base sees of the tip, effects of sensing included; base frame."""
-
-    tip_position: Floats
-    """(n_robots, 3) [m]."""
-    tip_rotation: Floats
-    """(n_robots, 3, 3) base_from_tip."""
-    points: Floats
-    """(n_robots, k, 3) at the robot's `log_points` [m]; k is 0 with outputs="tip"."""
-
-
-class Link(NamedTuple):
-    """One effect of the batch."""
-
-    name: str
-    effect: Effect
-    values: Floats
-    """(n_robots, n_columns)."""
-    memory: Floats
-    """(n_robots, m)."""
 
 
 def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
@@ -100,21 +80,17 @@ class EffectPipeline:
                 for named, r in zip(tables, robots, strict=True)
             ]
             values = np.broadcast_to(np.array(rows), (n_robots, len(rows[0]))).copy()
-            self.links.append(Link(name, get_effect(name), values, self._fresh(get_effect(name))))
+            self.links.append(executor.link(name, values, self.routing.n_tendons))
         self.time = np.full(n_robots, np.nan)
         """(n_robots,) since the first step [s]; nan before it."""
 
     def __bool__(self) -> bool:
         return bool(self.links)
 
-    def _fresh(self, what: Effect) -> Floats:
-        memory = what.memory(self.n_robots, self.routing.n_tendons)
-        return np.empty((self.n_robots, 0)) if memory.size == 0 else memory
-
     def reset(self, rows: Any) -> None:
         """Let these robots begin at rest again."""
         for link in self.links:
-            link.memory[rows] = self._fresh(link.effect)[rows]
+            link.memory[rows] = executor.at_rest(link.effect, self.n_robots, self.routing.n_tendons)[rows]
         self.time[rows] = np.nan
 
     def act(
@@ -126,9 +102,9 @@ class EffectPipeline:
         n_steps: int,
         skip: Flags,
         gravity: Floats | None = None,
-    ) -> tuple[Ports, Params]:
-        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs
-        cannot be used.
+    ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
+        """What the kernel reads at this step, and the point forces of effects (`close_ports`). Memories move
+        on, but for the robots `skip`, whose inputs cannot be used.
 
         `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
         """
@@ -137,7 +113,7 @@ class EffectPipeline:
         self.time = np.where(skip, self.time, np.where(first, 0.0, self.time + dt))
         before = [link.memory.copy() for link in self.links] if skip.any() else []
         opened = self._open(ports, params, n_steps)
-        self._apply(opened, state, dt, self.links)
+        executor.act(self.links, opened, state, dt)
         for link, old in zip(self.links, before, strict=bool(before)):
             link.memory[skip] = old[skip]
         return close_ports(opened, ports, params)
@@ -151,7 +127,7 @@ class EffectPipeline:
             links = [link._replace(memory=link.memory.copy()) for link in self.links]
             given = {"tendon_length": driven, "tension": driven, "extension": extension}
             opened = self._open(ports._replace(**given), params, n_steps)
-            self._apply(opened, state, 0.0 * dt, links)
+            executor.act(links, opened, state, 0.0 * dt)
             driven = np.where(self._pulled, opened.tension, opened.tendon_length)
             return np.concatenate([driven, opened.extension], axis=1)
 
@@ -180,12 +156,7 @@ class EffectPipeline:
         self, measurement: SensedPoses, ports: Ports, params: Params, dt: float, n_steps: int
     ) -> SensedPoses:
         """The measurement with the effects of sensing."""
-        opened = self._open(ports, params, n_steps)
-        opened.tip_position, opened.tip_rotation, opened.points = (a.copy() for a in measurement)
-        for link in self.links:
-            if link.effect.seam is Seam.SENSING:
-                link.effect.apply(link.values, link.memory, opened, None, dt)
-        return SensedPoses(opened.tip_position, opened.tip_rotation, opened.points)
+        return executor.sense(self.links, self._open(ports, params, n_steps), measurement, dt)
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
         opened = open_ports(
@@ -213,8 +184,3 @@ class EffectPipeline:
             # a bad input: nan passes through an effect without a warning, inf does not
             given[np.isinf(given)] = np.nan
         return opened
-
-    def _apply(self, opened: EffectPorts, state: Any, dt: float, links: Sequence[Link]) -> None:
-        for link in links:
-            if link.effect.seam is not Seam.SENSING:
-                link.effect.apply(link.values, link.memory, opened, state, dt)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fastrod.errors import EffectError, nearest
 from fastrod.model.routing import Routing
-from fastrod.rotation import product, quaternion_from_vector
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats, Params, Ports
 
 CHANGEABLE = (
@@ -75,6 +77,12 @@ class EffectPorts:
     """(n, n_segments, n_f, 3) [N/m]."""
     n_steps: int
     """Read: integration steps of a segment."""
+    stateless: bool = False
+    """Read: rows are samples of a log; no state is carried from one to the next."""
+    state: Any = None
+    """Read: the last `State`, as `apply` has it."""
+    point_forces: list[tuple[Floats, Floats]] = field(default_factory=list)
+    """Arclength (n,) [m] and force (n, 3) [N] of each that effects have added through `add_point_force`."""
     tip_position: Floats = field(default_factory=_none)
     """SENSING only: (n, 3) base frame [m]."""
     tip_rotation: Floats = field(default_factory=_none)
@@ -84,6 +92,17 @@ class EffectPorts:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def rows(self, which: slice) -> EffectPorts:
+        """A copy of some rows."""
+        alike = ("routing", "rest_length", "n_steps", "stateless", "state")
+        return EffectPorts(
+            **{
+                f.name: getattr(self, f.name) if f.name in alike else getattr(self, f.name)[which].copy()
+                for f in fields(self)
+                if f.name != "point_forces"
+            }
+        )
 
     def __getattr__(self, name: str) -> Any:
         if name in (old := {"wiring": "routing", "shift_wires": "shift_tendons"}):
@@ -146,6 +165,46 @@ class EffectPorts:
         """Add (n, n_segments, 3) [N/m], uniform over each segment."""
         self.line_force += force[:, :, None, :]
 
+    def add_point_force(
+        self, arclength: ArrayLike, force: ArrayLike, frame: Literal["world", "material"] = "world"
+    ) -> None:
+        """Add (n, 3) or (3,) [N] at arclengths (n,), or one for all [m]; beyond the tip is at the tip.
+
+        A "material" force is along d1, d2, d3 of the cross-section where it acts, as it stood in the last
+        state; before the first, as in the straight rod. Raises `EffectError` for another frame, for a shape
+        that does not fit, and for a material force where no shape is carried: over a log, and with
+        outputs="tip".
+        """
+        n = len(self)
+        try:
+            at = np.array(np.broadcast_to(np.asarray(arclength, float), (n,)))
+            vector = np.array(np.broadcast_to(np.asarray(force, float), (n, 3)))
+        except (TypeError, ValueError) as error:
+            raise EffectError(
+                f"a point force has arclength of shape {np.shape(arclength)} and force of shape "
+                f"{np.shape(force)}; give ({n},) [m] and ({n}, 3) [N]."
+            ) from error
+        if frame == "material":
+            vector = np.einsum("nij,nj->ni", self._cross_section(at), vector)
+        elif (given := str(frame)) != "world":  # a law of somebody's package may say anything
+            raise EffectError(f"no frame {given!r} of a point force; {nearest(given, ('world', 'material'))}")
+        self.point_forces.append((at, vector))
+
+    def _cross_section(self, arclength: Floats) -> Floats:
+        """(n, 3, 3) world_from_material at (n,) [m]: the last state's, on the base where it is now."""
+        base, last = matrix_from_quaternion(self.base_pose[:, 3:]), self.state
+        if self.stateless or (last is not None and not len(last.arclength)):
+            where = "over a log no state is carried" if self.stateless else "outputs='tip' keeps no shape"
+            raise EffectError(f"a point force in the material frame goes by the last shape; {where}.")
+        if last is None:
+            return base
+        row = np.arange(len(self))
+        node = np.abs(last.arclength - arclength[:, None]).argmin(1)
+        beyond = (arclength - last.arclength[row, node])[:, None] * last.curvature[row, node]
+        there = last.rotation[row, node] @ matrix_from_quaternion(quaternion_from_vector(beyond))
+        found = base @ np.swapaxes(last.rotation[:, 0], 1, 2) @ there
+        return np.where(np.isfinite(found).all((1, 2))[:, None, None], found, base)
+
 
 def _rows(a: Floats, n: int) -> Floats:
     return np.array(np.broadcast_to(a, (n, *a.shape[1:])), order="C")
@@ -162,6 +221,7 @@ def open_ports(
     base_rotation: Floats,
     time: Floats,
     n_steps: int,
+    stateless: bool = False,
 ) -> EffectPorts:
     """The ports of a step with a row for each of `n` robots, ready to be changed."""
     return EffectPorts(
@@ -183,11 +243,15 @@ def open_ports(
         tip_moment=_rows(ports.tip_moment, n),
         line_force=_rows(ports.line_force, n),
         n_steps=n_steps,
+        stateless=stateless,
     )
 
 
-def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Ports, Params]:
-    """What the kernel reads, from ports that effects have changed."""
+def close_ports(
+    opened: EffectPorts, ports: Ports, params: Params
+) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
+    """What the kernel reads, from ports that effects have changed, and the point forces (arclength (n,) [m],
+    force (n, 3) world [N]) that they have added."""
     return (
         ports._replace(
             tendon_length=opened.tendon_length,
@@ -201,4 +265,8 @@ def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Port
             line_force=np.ascontiguousarray(opened.line_force),
         ),
         params._replace(offset=opened.offset, compliance=opened.compliance, pretension=opened.pretension),
+        [
+            (np.minimum(arclength, (params.length + opened.extension).sum(1)), force)
+            for arclength, force in opened.point_forces
+        ],
     )

@@ -77,7 +77,7 @@ def excitation(
     does not make it snap, F l^2 / EI = 1. Without
     `turn` the base stays as it is, where a bench cannot be turned.
 
-    Raises `InputError` for a robot that wires do not drive, or for numbers that are not positive.
+    Raises `InputError` for a robot that tendons do not drive, or for numbers that are not positive.
     """
     if not robot.n_tendons:
         raise InputError(f"robot {robot.name!r} has no tendons; there is nothing to excite.")

@@ -174,7 +174,7 @@ class Robot:
 
     >>> tendon = Tendon(offset=0.0075, angle=0.0)
     >>> rod = Segment(length=0.07, bending_stiffness=(0.0022,) * 2, torsional_stiffness=1e-3,
-    tendons=(tendon,))
+    ...               tendons=(tendon,))
     >>> Robot(name="one", segments=(rod,)).rest_tendon_length
     array([0.07])
     """

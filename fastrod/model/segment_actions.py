@@ -80,7 +80,7 @@ class SegmentActions:
         return 3 * self.robot.n_segments
 
     def inputs(self, action: ArrayLike) -> TendonInputs:
-        """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is
+        """Tendon lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is
         not one."""
         refuse_masked("action", action)
         try:

@@ -407,6 +407,17 @@ class Reader:
             node_force[inside, node[inside, q]] += force[inside, q]
         return grid, node_force
 
+    def with_point_forces(self, ports: Ports, given: Inputs, more: PointForces) -> tuple[Ports, Inputs]:
+        """`ports` with point forces beside those of `given`, and the inputs with them. Raises `InputError` as
+        `point_forces` does."""
+        given = given._replace(point_force=[*(given.point_force or ()), *more])
+        grid, node_force = self.point_forces(given.point_force, ports.extension)
+        line_force = ports.line_force
+        if given.line_force is not None and np.ndim(given.line_force) > 2:  # samples, between other nodes now
+            before, after = (self.line_force(given.line_force, nodes) for nodes in (ports.grid, grid))
+            line_force = np.ascontiguousarray(line_force + (after - before))
+        return ports._replace(grid=grid, node_force=node_force, line_force=line_force), given
+
 
 def _per_step(sampled: Floats, nodes: Floats) -> Floats:
     """(n, n_segments, 2 n_steps, 3) line force at both ends of each step, from samples evenly spaced over

@@ -310,9 +310,14 @@ class Statics:
         if self._chain:
             bare, params = self._bare, self._passes.params
             self._bare = ports
-            ports, self._passes.params = self._chain.act(
+            ports, self._passes.params, points = self._chain.act(
                 ports, self._plain, self._state, self.dt, self._layout.n_steps, out, self._reader.gravity
             )
+            if points:
+                ports, self._given = self._reader.with_point_forces(ports, given, points)
+                out[list(self._reader.problems)] = True
+                some_out = bool(out.any())
+                rows = np.flatnonzero(~out)
             if only is not None and bare is not None:
                 self._bare = merge_arrays(self._bare, bare, ~only)
                 self._passes.params = merge_arrays(self._passes.params, params, ~only)
@@ -366,11 +371,11 @@ class Statics:
         """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over
         the material."""
         grid, node_force = self._reader.point_forces(self._given.point_force, extension)
-        return {
-            "grid": grid,
-            "node_force": node_force,
-            "line_force": self._reader.line_force(self._given.line_force, grid),
-        }
+        line_force = self._reader.line_force(self._given.line_force, grid)
+        if self._bare is not None and self._ports is not None:  # and what effects have added to it
+            bare = self._reader.line_force(self._given.line_force, self._ports.grid)
+            line_force = line_force + (self._ports.line_force - bare)
+        return {"grid": grid, "node_force": node_force, "line_force": line_force}
 
     def _move_obstacles(self, moved: tuple[Any, Any] | None) -> None:
         if self._engine is not None and moved is not None:

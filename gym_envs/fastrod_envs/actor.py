@@ -151,7 +151,7 @@ def actor_of(model: Any) -> Actor:
         tuple(plain(module.weight) for module in linear),
         tuple(plain(module.bias) for module in linear),
         plain(features.middle),
-        plain(features.half_range),
+        plain(features.reach),
         "tanh" if isinstance(hidden, torch.nn.Tanh) else "relu",
         squashed,
     )

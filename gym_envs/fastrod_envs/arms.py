@@ -1,5 +1,5 @@
-"""What the tasks with arms share: a soft robot whose base is told where to be, and how arms and boxes are
-drawn."""
+"""What the tasks with arms share: a soft robot whose base is commanded where to be, and how arms and boxes
+are drawn."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class HostedTask(Task):
                 robot = self._random.draw(self.base_robot, row[None, self.n_draws :])[0]
             try:
                 self.cells[i].begin(row[: self.n_draws], self.difficulty, robot)
-            except HostError:  # a world in which the rod is lost is not mended: another takes its place
+            except HostError:  # a world in which the rod is lost is not repaired: another takes its place
                 self.cells[i].close()
                 self.cells[i] = self.cell()
                 self.cells[i].begin(row[: self.n_draws], self.difficulty, robot)

@@ -1,4 +1,4 @@
-"""What every task can be told: length of an episode, what is observed, what an action is, what differs from
+"""What every task can be given: length of an episode, what is observed, what an action is, what differs from
 robot to robot."""
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def checked_difficulty(level: float) -> float:
 
 
 def checked_mapping(given: object) -> dict[str, Any]:
-    """What `reset` is told, as a new dictionary, or `InputError`."""
+    """What `reset` is given, as a new dictionary, or `InputError`."""
     if given is not None and not isinstance(given, Mapping):
         raise InputError(f"options are {given!r}; give a dictionary, or None.")
     return dict(given or {})

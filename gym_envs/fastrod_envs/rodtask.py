@@ -109,7 +109,7 @@ class RodTask(Task):
         self._home_tip, self._home_direction = self.tip[0].copy(), self.direction[0].copy()
 
     def loads(self) -> dict[str, Any]:
-        """What the simulator is told besides tendons: loads, obstacles."""
+        """What the simulator is given besides tendons: loads, obstacles."""
         return {}
 
     def start(self, rows: Ints, draws: Floats) -> None:

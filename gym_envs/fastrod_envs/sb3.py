@@ -20,7 +20,7 @@ from fastrod_envs.vector import BatchEnv
 @final
 class BatchVecEnv(VecEnv):
     """A `BatchEnv` as stable-baselines3 wants it: `terminal_observation`, `TimeLimit.truncated` and `episode`
-    in the infos of those that ended, with what the last step told of them (distance, success, ...).
+    in the infos of those that ended, with what the last step reported of them (distance, success, ...).
 
     >>> env = BatchVecEnv(BatchEnv("Reach", num_envs=2))
     >>> env.reset().shape == (2, *env.observation_space.shape)

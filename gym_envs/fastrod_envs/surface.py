@@ -25,7 +25,7 @@ class ReachableSurface:
     """The surface as a camera on the base measures it, in the base frame, for points up to `radius` [m] from
     the axis at one `height` [m].
 
-    Effects between motor and wire change how a point is reached, and not which points; they are left out.
+    Effects between motor and tendon change how a point is reached, and not which points; they are left out.
     Those of load, material and sensing are in.
     """
 

@@ -1,8 +1,6 @@
 """A real browser: Debian's chromium, driven by playwright. Where it is missing these tests skip, but for
 .ci/run, where they fail."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -11,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from windows import ARGUMENTS, Window
+from windows import ARGUMENTS, PATIENCE, Window
 
 import fastrod
 from fastrod.identification.attribution import identify
@@ -44,6 +42,13 @@ def chromium() -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(autouse=True)
+def _slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a graphics card, and on one core, a browser takes seconds to answer."""
+    monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 30.0)
+    monkeypatch.setattr("fastrod_viewer.session._SAID", PATIENCE)
 
 
 @pytest.fixture

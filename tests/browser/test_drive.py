@@ -1,7 +1,4 @@
-"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is
-closed."""
-
-from __future__ import annotations
+"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and a page that is closed."""
 
 from collections.abc import Callable
 
@@ -30,30 +27,22 @@ def tip_of(app: App) -> np.ndarray:
 
 def at_rest(app: App) -> bool:
     """The page's camera has come to where it begins, and the server knows."""
-    clients = list(app.server.get_clients().values())
-    return bool(
-        clients and np.linalg.norm(clients[0].camera.position - app.server.initial_camera.position) < 1e-2
-    )
+    begins, clients = app.server.initial_camera.position, list(app.server.get_clients().values())
+    return bool(clients and np.linalg.norm(clients[0].camera.position - begins) < 1e-2)
 
 
 def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window: Windows) -> None:
     app.open("prototype")
     seen = window(app.address)
-    before, pixels = tip_of(app), seen.pixels()
-    thumb = seen.slider("Bend x [°]")
-    thumb.focus()
-    for _ in range(45):
-        thumb.press("ArrowRight")
-    assert seen.until(
-        lambda: page_of(app).teleop.arrived and page_of(app).teleop.bent(0)[0] > np.radians(44.0)
-    )
+    before, pixels, teleop = tip_of(app), seen.pixels(), page_of(app).teleop
+    seen.slide("Bend x [°]", "ArrowRight", 45)
+    assert seen.until(lambda: teleop.arrived and teleop.bent(0)[0] > np.radians(44.0))
     # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; tendons of 1e-5 m/N stretch a
     # little
     a, length = np.radians(45.0), 0.07
     assert tip_of(app)[0] - before[0] == pytest.approx((1.0 - np.cos(a)) * length / a, rel=0.03)
     seen.page.wait_for_timeout(500)
-    moved = np.abs(seen.pixels().astype(int) - pixels)[100:700, 340:].max(axis=2) > 40
-    assert moved.sum() > 2000
+    assert seen.changed(pixels)[100:700, 340:].sum() > 2000
     assert seen.errors == []
 
 
@@ -71,7 +60,6 @@ def test_the_tip_follows_a_drag(app: App, window: Windows) -> None:
         seen.page.wait_for_timeout(30)
     assert seen.until(lambda: page_of(app).teleop.dragged_to is not None)
     pull = page_of(app).teleop.dragged_to
-    assert pull is not None
     assert seen.until(lambda: bool(np.linalg.norm(tip_of(app) - pull) < 2e-3))
     mouse.up()
     assert seen.until(lambda: page_of(app).teleop.dragged_to is None)
@@ -103,10 +91,10 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     seen.page.wait_for_timeout(300)
     assert abs(page.teleop.now.action[1]) < 1e-12
     keys.press("Escape")
-    seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
+    seen.button("STOP").dblclick()
     seen.page.wait_for_timeout(300)
     assert page.session.stopped
-    seen.page.get_by_role("button", name="Resume", exact=True).click()
+    seen.button("Resume").click()
     assert seen.until(lambda: not page.session.stopped)
     keys.press("r")
     assert seen.until(lambda: float(np.abs(page.teleop.goals.action).max()) < 1e-9)
@@ -125,27 +113,19 @@ def test_a_load_bends_the_robot(app: App, window: Windows) -> None:
     app.open("tdcr_b")
     seen = window(app.address)
     before = tip_of(app)
-    seen.page.get_by_role("tab", name="Loads").click()
-    thumb = seen.slider("Tip force x [N]")
-    thumb.focus()
-    for _ in range(10):
-        thumb.press("ArrowRight")
+    seen.tab("Loads")
+    seen.slide("Tip force x [N]", "ArrowRight", 10)
     assert seen.until(lambda: float(tip_of(app)[0] - before[0]) > 1e-3)
 
 
 def test_two_pages_show_the_same_and_closing_one_changes_nothing(app: App, window: Windows) -> None:
     app.open("prototype")
     first, second = window(app.address), window(app.address)
-    thumb = first.slider("Bend x [°]")
-    thumb.focus()
-    for _ in range(20):
-        thumb.press("ArrowRight")
+    first.slide("Bend x [°]", "ArrowRight", 20)
     assert second.until(lambda: second.slider("Bend x [°]").get_attribute("aria-valuenow") == "20")
     first.close()
     assert second.until(lambda: len(app.server.get_clients()) == 1)
-    thumb = second.slider("Bend x [°]")
-    thumb.focus()
-    thumb.press("ArrowRight")
+    second.slide("Bend x [°]", "ArrowRight")
     assert second.until(lambda: abs(page_of(app).teleop.bent(0)[0] - np.radians(21.0)) < 1e-6)
 
 
@@ -156,22 +136,20 @@ def test_of_two_pages_one_drives(app: App, window: Windows, monkeypatch: pytest.
     app.open("prototype")
     first, second = window(app.address), window(app.address)
     teleop = page_of(app).teleop
-    assert first.until(lambda: first.page.get_by_text("No page has the controls.").count() == 1)
+    assert first.shows("No page has the controls.", once=True)
     first.page.keyboard.press("l")
-    assert first.until(lambda: first.page.get_by_text("This page has the controls.").count() == 1)
-    assert second.until(lambda: second.page.get_by_text("This one watches").count() == 1)
+    assert first.shows("This page has the controls.", once=True)
+    assert second.shows("This one watches", once=True)
     bent = teleop.bent(0)[0]
     assert bent > 0.05
-    thumb = second.slider("Bend x [°]")
-    thumb.focus()
-    thumb.press("End")
-    assert second.until(lambda: second.page.get_by_text("Request them in the window Controls").count() == 1)
+    thumb = second.slide("Bend x [°]", "End")
+    assert second.shows("Request them in the window Controls", once=True)
     assert second.until(lambda: thumb.get_attribute("aria-valuenow") == "5")  # it goes back
     assert teleop.bent(0)[0] == bent
     for answer in ("Keep control", "Yield control"):
         second.page.get_by_role("button", name="Request control").click()
         first.page.get_by_role("button", name=answer).click()
-    assert second.until(lambda: second.page.get_by_text("This page has the controls.").count() == 1)
+    assert second.shows("This page has the controls.", once=True)
     thumb.focus()
     thumb.press("ArrowRight")
     assert second.until(lambda: teleop.bent(0)[0] > bent + 0.01)
@@ -203,12 +181,8 @@ def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     link = SimulatedRobot(robot, real=True)
     app.open(FreeWorld(robot), link=link)
     seen = window(app.address)
-    thumb = seen.slider("Speed [°/s]")
-    thumb.focus()
-    thumb.press("Home")  # slow, so that it is still on its way
-    thumb = seen.slider("Bend x [°]")
-    thumb.focus()
-    thumb.press("End")
+    seen.slide("Speed [°/s]", "Home")  # slow, so that it is still on its way
+    seen.slide("Bend x [°]", "End")
     assert seen.until(lambda: bool(link.read().dl.min() < -1e-5))
     assert not link.stopped
     seen.close()
@@ -220,14 +194,13 @@ def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     assert there.min() > -0.0075 * np.pi / 2.0 + 1e-3  # it had not arrived
     other.go(app.address)
     other.page.wait_for_timeout(1100)  # sooner it is ignored
-    other.page.get_by_role("button", name="Resume", exact=True).click()
+    other.button("Resume").click()
     assert other.until(lambda: not link.stopped)
 
 
 def test_it_fits_a_phone(app: App, window: Windows) -> None:
     app.open("prototype")
     seen = window(app.address, width=390, height=844)
-    wide = seen.page.evaluate("document.documentElement.scrollWidth")
-    assert wide <= 390
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= 390
     colors = np.unique(seen.pixels()[:400].reshape(-1, 3), axis=0)
     assert len(colors) > 200  # the robot is drawn above the sheet of controls

@@ -1,26 +1,23 @@
 """The emulated prototype in a real browser: driven, stopped, released, left alone, recorded."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+from pages import DRIVE
 from windows import PATIENCE, Window
 
-from fastrod.logs.link import Measurement
-from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import read_log
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
@@ -30,24 +27,22 @@ from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.worlds import FreeWorld
 
 Windows = Callable[..., Window]
+FREEZE = "() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }"
 CYCLE = 0.01
 STANDS = 2e-5  # m of a tendon: what noise of the plant and the drives' regulators leave
 
 
 class Paced:
-    """The emulated prototype in stepped time, a cycle every 10 ms at most: however busy the machine is, no
-    cycle of its own is late."""
+    """The emulated prototype in stepped time: on the busiest machine no cycle of its own is late."""
 
     real = True
 
     def __init__(self, setup: EmulatedBench) -> None:
-        self.prototype = setup.prototype
-        self.robot, self.supervisor, self.clock = (
-            setup.prototype.robot,
-            setup.prototype.supervisor,
-            setup.prototype.clock,
-        )
-        self.source = setup.prototype.source
+        self.prototype = made = setup.prototype
+        self.robot, self.supervisor = made.robot, made.supervisor
+        self.clock, self.source = made.clock, made.source
+        self.command, self.read, self.stop = made.command, made.read, made.stop
+        self.recorder_for, self.record = made.recorder_for, made.record
         self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -58,23 +53,8 @@ class Paced:
     sighting = property(lambda self: self.prototype.sighting)
     elapsed = property(lambda self: self.prototype.elapsed)
 
-    def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
-        self.prototype.command(dl, ext)
-
-    def read(self) -> Measurement:
-        return self.prototype.read()
-
-    def stop(self) -> None:
-        self.prototype.stop()
-
     def release(self) -> None:
         self.requests.put(self.prototype.release)
-
-    def recorder_for(self, path: str) -> Recorder:
-        return self.prototype.recorder_for(path)
-
-    def record(self, recorder: Recorder | None) -> None:
-        self.prototype.record(recorder)
 
     def picture(self) -> NDArray[np.uint8] | None:
         return np.full((480, 640, 3), (20, 200, 40), dtype=np.uint8)
@@ -110,14 +90,14 @@ class Bed:
         assert isinstance(app.page, DrivePage)
         self.page = app.page
 
-    def bend(self, seen: Window, key: str, label: str = "Bend x [°]") -> None:
-        thumb = seen.slider(label)
-        thumb.focus()
-        thumb.press(key)
+    def bend(self, seen: Window, key: str) -> None:
+        seen.slide("Bend x [°]", key)
 
     def slowly(self, seen: Window) -> None:
-        """At 5 degrees a second, so that it moves for long."""
-        self.bend(seen, "Home", "Speed [°/s]")
+        """Bend far at 5 degrees a second, so that it moves for long; it has begun."""
+        seen.slide("Speed [°/s]", "Home")
+        self.bend(seen, "End")
+        assert seen.until(lambda: bool(self.link.change()[0] < -3e-4))
 
     def stands(self, seen: Window) -> bool:
         """The drives stand, for so many cycles."""
@@ -130,17 +110,10 @@ class Bed:
     def go_on(self, seen: Window) -> None:
         """When a person has had time to see why it stopped."""
         seen.page.wait_for_timeout(1100)
-        seen.page.get_by_role("button", name="Resume", exact=True).click()
+        seen.button("Resume").click()
 
     def says(self, seen: Window, words: str) -> bool:
-        return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
-
-
-@pytest.fixture(autouse=True)
-def _slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a graphics card, and on one core, a browser takes seconds to answer."""
-    monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 30.0)
-    monkeypatch.setattr("fastrod_viewer.session._SAID", PATIENCE)
+        return seen.shows(re.compile(words))
 
 
 @pytest.fixture
@@ -156,7 +129,7 @@ def test_a_person_drives_it_and_the_page_shows_what_it_says(bed: Bed, window: Wi
     bed.bend(seen, "End")
     assert seen.until(lambda: bed.page.teleop.arrived and bool(bed.link.change()[0] < -7.9e-3))
     # 61 degrees are the most whole ones that 8 mm of tendon are good for, at 7.5 mm from the backbone
-    np.testing.assert_allclose(bed.link.change(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
+    assert_allclose(bed.link.change(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
     for words in (
         "The robot follows commands.",
         "marker seen",
@@ -181,7 +154,7 @@ def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) 
         bed = Bed(setup, app)
         seen = window(app.address)
         bed.bend(seen, "End")
-        assert bed.says(seen, "segment 1 was told to bend with 8.* 1/m; this robot's limit is 8 1/m.")
+        assert bed.says(seen, "segment 1 was commanded to bend with 8.* 1/m; this robot's limit is 8 1/m.")
         assert 0.52 < bed.page.teleop.bent(0)[0] <= 8.0 * 0.07
         assert bed.stands(seen)
         assert not bed.page.session.stopped
@@ -194,9 +167,7 @@ def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) 
 def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) -> None:
     seen = window(bed.app.address)
     bed.slowly(seen)
-    bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
-    seen.page.get_by_role("button", name="STOP", exact=True).click()
+    seen.button("STOP").click()
     assert seen.until(lambda: bed.page.session.stopped)
     assert bed.stands(seen)
     there = bed.link.change()
@@ -206,32 +177,25 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.stands(seen)
-    np.testing.assert_allclose(bed.link.change(), there, atol=5e-5)
+    assert_allclose(bed.link.change(), there, atol=5e-5)
     assert bed.page.teleop.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
     bed.bend(seen, "Home")
     assert seen.until(lambda: bool(bed.link.change()[0] > there[0] + 2e-4))
 
 
-def test_stop_only_stops_however_often_it_is_pressed(
-    bed: Bed, window: Windows, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_only_stops_however_often_it_is_pressed(bed, window, monkeypatch):
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
-        assert each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
+        assert each.button("Resume").is_disabled()
     bed.slowly(seen)
-    bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     with monkeypatch.context() as patch:
         patch.setattr("fastrod_viewer.session._HASTY", PATIENCE)  # a click may need a second
-        seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
+        seen.button("STOP").dblclick()
         assert seen.until(lambda: bed.page.session.stopped)
-        seen.page.get_by_role("button", name="Resume", exact=True).click()
+        seen.button("Resume").click()
         assert bed.says(seen, "Resume within a second of a stop is ignored; press it again.")
         assert bed.stands(seen)
-    for press in (
-        lambda: other.page.get_by_role("button", name="STOP", exact=True).click(),
-        lambda: other.page.keyboard.press("Escape"),
-    ):
+    for press in (other.button("STOP").click, lambda: other.page.keyboard.press("Escape")):
         press()
         other.page.wait_for_timeout(1100)
         assert bed.page.session.stopped
@@ -243,15 +207,11 @@ def test_stop_only_stops_however_often_it_is_pressed(
     bed.go_on(seen)
     assert other.until(lambda: not bed.page.session.stopped)
     for each in (seen, other):
-        assert each.until(
-            lambda each=each: each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
-        )
+        assert each.until(each.button("Resume").is_disabled)
         assert each.errors == []
 
 
-def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(
-    bed: Bed, window: Windows
-) -> None:
+def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed, window):
     seen = window(bed.app.address)
     assert bed.says(seen, "marker seen")
     bed.emulator.hidden = True
@@ -269,21 +229,15 @@ def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(
 
 
 @pytest.mark.parametrize("how", ["closed", "frozen"])
-def test_nothing_moves_when_nobody_watches(
-    bed: Bed, window: Windows, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     seen, other = window(bed.app.address), window()
     bed.slowly(seen)
-    bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     if how == "closed":
         seen.close()
     else:
         monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 3.0)
         seen.page.wait_for_timeout(2000)  # for whoever is asked with more
-        seen.page.evaluate(
-            "() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }"
-        )
+        seen.page.evaluate(FREEZE)
     assert other.until(lambda: bed.link.prototype.supervisor.first is not None)
     assert bed.stands(other)
     there = bed.link.change()
@@ -292,16 +246,14 @@ def test_nothing_moves_when_nobody_watches(
     assert bed.says(other, "nobody watches the robot any more")
     bed.bend(other, "End")
     assert bed.stands(other)
-    np.testing.assert_allclose(bed.link.change(), there, atol=STANDS)
+    assert_allclose(bed.link.change(), there, atol=STANDS)
     bed.go_on(other)
     assert other.until(lambda: not bed.page.session.stopped)
 
 
-def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
-    bed: Bed, window: Windows, tmp_path: Path
-) -> None:
+def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed, window, tmp_path):
     seen = window(bed.app.address)
-    seen.page.get_by_role("tab", name="Save").click()
+    seen.tab("Save")
     seen.page.get_by_role("button", name="Record a run log").click()
     assert seen.until(lambda: bed.page.session.recorder is not None)
     for _ in range(4):
@@ -316,7 +268,7 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
     rate = load_hardware().camera.rate
     assert len(log) > 8
     # each frame once, by the clock that cycles count
-    np.testing.assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)
+    assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)
     assert 0.0 <= log.t[0] < 0.2
     assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(20.0), abs=1e-4)
     # an arc of 20 degrees and 70 mm ends 12 mm beside its base
@@ -326,27 +278,11 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
 
 
 def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Windows) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "fastrod.commands.cli",
-        "drive",
-        "--emulate",
-        "--seed",
-        "3",
-        "--no-home",
-        "--no-open",
-        "--port",
-        "0",
-    ]
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
+    with Popen(DRIVE, cwd=tmp_path, stdout=PIPE, stderr=PIPE, text=True) as process:
         line = process.stdout.readline()
         assert "http://127.0.0.1:" in line, process.communicate()
         seen = window(line.split()[1])
-        seen.page.get_by_role("tab", name="Save").click()
+        seen.tab("Save")
         seen.page.get_by_role("button", name="Record a run log").click()
         assert seen.until(lambda: any(p.stat().st_size > 2000 for p in tmp_path.glob("*.part")))
         process.send_signal(signal.SIGTERM)

@@ -1,9 +1,8 @@
 """Record, replay, export in a real browser."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,47 +25,55 @@ def replayed(app: App) -> ReplayPage:
     return app.page
 
 
+def box_at_rest(seen: Window, thumb: Any) -> Any:
+    """The box of a slider's thumb when it has come to where it goes."""
+    boxes = [thumb.bounding_box()]
+
+    def stands() -> bool:
+        seen.page.wait_for_timeout(500)
+        boxes.append(thumb.bounding_box())
+        return bool(boxes[-1] == boxes[-2])
+
+    assert seen.until(stands)
+    return boxes[-1]
+
+
 def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windows) -> None:
     app.open(DEMO_LOG)
-    seen = window(app.address)
     page = replayed(app)
-    thumb = seen.slider("Time [s]")
-    thumb.focus()
-    thumb.press("End")  # whoever moves the slider has paused it
-    assert seen.until(lambda: seen.page.get_by_role("button", name="Play").count() == 1)
+    page._toggle()  # what plays moves the slider, too
+    seen = window(app.address)
+    thumb = seen.slide("Time [s]", "End")
     assert seen.until(lambda: page.frame == len(page.playback.frames) - 1)
     row = page.playback.frames[-1]
-    shown = f"{1e3 * page.playback.before.residual[row]:.2f} mm"
-    assert seen.until(lambda: seen.page.get_by_text(shown).count() > 0)
-    right = thumb.bounding_box()
+    assert seen.shows(f"{1e3 * page.playback.before.residual[row]:.2f} mm")
+    right = box_at_rest(seen, thumb)
     thumb.press("Home")
     assert seen.until(lambda: page.frame == 0)
-    seen.page.wait_for_timeout(500)
-    before, left = seen.pixels(), thumb.bounding_box()
-    rotated_at = float(
-        page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))]
-    )
-    fraction = (rotated_at + 5.0) / page.playback.duration  # the base lies on its side there
-    seen.page.mouse.click(
-        left["x"] + 0.5 * left["width"] + fraction * (right["x"] - left["x"]),
-        left["y"] + 0.5 * left["height"],
-    )
+    left = box_at_rest(seen, thumb)
+    assert left["x"] < right["x"]
+    before = seen.pixels()
+    aside = np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))  # the base lies on its side
+    rotated_at = float(page.playback.frame_time[aside])
+    fraction = (rotated_at + 5.0) / page.playback.duration
+    x = left["x"] + 0.5 * left["width"] + fraction * (right["x"] - left["x"])
+    seen.page.mouse.click(x, left["y"] + 0.5 * left["height"])
     assert seen.until(lambda: abs(page.playback.frame_time[page.frame] - rotated_at) < 10.0)
     seen.page.wait_for_timeout(500)
-    assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 1000
+    assert seen.changed(before)[:500, 340:].sum() > 1000
+    for label in ("Play", "Pause"):
+        seen.page.get_by_role("button", name=label).click()
+    assert seen.until(lambda: seen.page.get_by_role("button", name="Play").count() == 1)
     assert seen.errors == []
 
 
-def test_before_and_after_can_be_switched(
-    app: App, window: Windows, tmp_path: Path, log_with_report: Path
-) -> None:
+def test_before_and_after_can_be_switched(app, window, tmp_path, log_with_report):
     app.open(load(log_with_report))
     seen = window(app.address)
     page = replayed(app)
     before, after = page.playback.tracks
     assert after.rms < before.rms
-    chosen = [before.label, after.label, "both"]
-    for option in chosen:
+    for option in (before.label, after.label, "both"):
         seen.pick("Model", option)
         assert seen.until(lambda option=option: page.choice == option)
     assert seen.page.get_by_text("friction").count() > 0
@@ -78,7 +85,7 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
     seen = window(app.address)
     page = app.page
     assert isinstance(page, DrivePage)
-    seen.page.get_by_role("tab", name="Save").click()
+    seen.tab("Save")
     seen.page.get_by_role("button", name="Record a run log").click()
     assert seen.until(lambda: page.session.recorder is not None)
     for _ in range(6):
@@ -101,17 +108,13 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
 
 
 @pytest.mark.parametrize("what", ["prototype", DEMO_LOG])
-def test_an_exported_page_opens_from_disk_without_a_network(
-    app: App, window: Windows, tmp_path: Path, what: str
-) -> None:
+def test_an_exported_page_opens_from_disk_without_a_network(app, window, tmp_path, what):
     app.open(what)
     seen = window(app.address)
     if what == "prototype":
-        seen.page.get_by_role("tab", name="Save").click()
-    with seen.page.expect_download() as waiting:
-        seen.page.get_by_role("button", name="Export as a web page").click()
+        seen.tab("Save")
     path = tmp_path / "page.html"
-    waiting.value.save_as(path)
+    seen.save("Export as a web page", path)
     assert external_references(path.read_text(encoding="utf-8")) == []
     alone = window(offline=True)
     alone.go(path.as_uri())
@@ -128,11 +131,8 @@ def test_a_picture_is_saved(app: App, window: Windows, tmp_path: Path) -> None:
 
     app.open("prototype")
     seen = window(app.address)
-    seen.page.get_by_role("tab", name="Save").click()
-    with seen.page.expect_download() as waiting:
-        seen.page.get_by_role("button", name="Save a picture (PNG)").click()
-    path = tmp_path / "picture.png"
-    waiting.value.save_as(path)
-    picture = imread(path)
+    seen.tab("Save")
+    seen.save("Save a picture (PNG)", tmp_path / "picture.png")
+    picture = imread(tmp_path / "picture.png")
     assert picture.shape[0] > 300
     assert picture.std() > 0.02

@@ -12,8 +12,10 @@ OFFSET, LENGTH = 0.0075, 0.07
 
 def prototype(compliance: float = 1e-7) -> Robot:
     """The paper's robot; wires that hardly stretch hold the mean curvature that they are given."""
-    wires = tuple(Tendon(offset=OFFSET, angle=0.5 * np.pi * i, compliance=compliance) for i in range(4))
-    rod = Segment(length=LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, tendons=wires)
+    routed = tuple(Tendon(offset=OFFSET, angle=0.5 * np.pi * i, compliance=compliance) for i in range(4))
+    rod = Segment(
+        length=LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, tendons=routed
+    )
     return Robot(name="prototype", segments=(rod,))
 
 

@@ -1,4 +1,4 @@
-"""Obstacles: what is refused and in which words, what is mended, what is left alone."""
+"""Obstacles: what is refused and in which words, what is fixed, what is left alone."""
 
 from __future__ import annotations
 

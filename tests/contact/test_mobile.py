@@ -67,7 +67,7 @@ def test_mobility_is_that_of_a_rigid_body(seed):
     # a rod
     rng = np.random.default_rng(seed)
     m = 5
-    touched = np.array([0.0, 1.0, 2.0, 0.0, -1.0])
+    touched = np.array([0, 1, 2, 0, -1])
     body = np.array([7, 7, 8])
     place = rng.normal(size=(m, 3))
     axes = np.array([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(m)])

@@ -20,9 +20,8 @@ from fastrod.kernels.contact.proximity import (
     ProximitySearch,
     search_obstacles,
     search_work,
-    thread_search_work,
 )
-from fastrod.types import CANDIDATE
+from fastrod.types import CANDIDATE, SearchWork
 
 
 @njit()
@@ -60,7 +59,7 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
             frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0],
             np.full(len(s), -np.inf),
             np.zeros((len(s), 3)),
-            thread_search_work(search_work(1, len(s)), 0),
+            SearchWork(*(room[0] for room in search_work(1, len(s)))),
             found,
         )
         assert gap <= phi.min() - radius + UNSEEN

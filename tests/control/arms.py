@@ -1,8 +1,7 @@
-"""A serial arm that shares no code with the package: chain of homogeneous matrices, numpy alone."""
-
-from __future__ import annotations
+"""A serial arm that shares no code with the package: chain of homogeneous matrices."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 UR5 = [
     (0.0, 0.089159, np.pi / 2),
@@ -23,30 +22,13 @@ class DhArm:
         frames = [np.eye(4)]
         for angle, (a, d, alpha) in zip(q, UR5, strict=True):
             c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
-            link = np.array(
-                [
-                    [c, -s * ca, s * sa, a * c],
-                    [s, c * ca, -c * sa, a * s],
-                    [0.0, sa, ca, d],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            )
-            frames.append(frames[-1] @ link)
+            rows = [c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s]
+            frames.append(frames[-1] @ np.array([*rows, [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]))
         return frames
 
     def frame(self, q: np.ndarray) -> np.ndarray:
         end = self.chain(q)[-1]
-        r = end[:3, :3]
-        # the eigenvector of Bar-Itzhack's matrix
-        m = np.array(
-            [
-                [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
-                [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
-                [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
-                [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
-            ]
-        )
-        x, y, z, w = np.linalg.eigh(m)[1][:, -1]
+        x, y, z, w = Rotation.from_matrix(end[:3, :3]).as_quat()
         return np.array([*end[:3, 3], w, x, y, z])
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:

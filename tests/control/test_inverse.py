@@ -1,7 +1,4 @@
-"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still
-goes there."""
-
-from __future__ import annotations
+"""Plans by learning: the nearest points of the workspace, and with effects the tip still goes there."""
 
 from dataclasses import replace
 from functools import cache
@@ -35,6 +32,10 @@ EFFECTS: dict[str, dict[str, float]] = {
 
 def with_effects(*names: str) -> Robot:
     return replace(PROTOTYPE, effects=tuple({"name": name, **EFFECTS[name]} for name in names))
+
+
+def with_segments(**change: Any) -> Robot:
+    return replace(PROTOTYPE, segments=tuple(replace(one, **change) for one in PROTOTYPE.segments))
 
 
 @cache
@@ -121,12 +122,8 @@ def test_all_at_once_and_a_camera_that_is_off() -> None:
 
 
 def test_the_base_may_stand_anyhow() -> None:
-    lying = replace(
-        with_effects("gravity"),
-        base_position=(0.3, -0.2, 0.1),
-        base_quaternion=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
-    )
-    given = plan(lying, LAP, RATE)
+    base = {"base_position": (0.3, -0.2, 0.1), "base_quaternion": (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)}
+    given = plan(replace(with_effects("gravity"), **base), LAP, RATE)
     path = slice(given.n_approach, None)
     assert_allclose(given.predicted[path], given.nearest[path], atol=1e-5)
     # gravity points elsewhere in this frame
@@ -167,10 +164,7 @@ def test_a_limit_is_kept_and_the_rest_done() -> None:
 
 
 def test_a_segment_that_extends_gets_to_the_path_itself() -> None:
-    longer = replace(
-        PROTOTYPE, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in PROTOTYPE.segments)
-    )
-    given = plan(longer, LAP, RATE)
+    given = plan(with_segments(extension=(0.0, 0.02)), LAP, RATE)
     path = slice(given.n_approach, None)
     assert given.rms_nearest < 1e-6
     assert_allclose(given.predicted[path], LAP, atol=1e-5)
@@ -231,8 +225,5 @@ def test_what_cannot_be_planned_is_said(options: dict[str, Any], sentence: str) 
 
 
 def test_a_robot_without_displacements_is_refused() -> None:
-    pulled = replace(
-        PROTOTYPE, segments=tuple(replace(segment, mode="tendon_tension") for segment in PROTOTYPE.segments)
-    )
     with pytest.raises(RobotError, match="an action needs tendons driven by length"):
-        plan(pulled, LAP, RATE)
+        plan(with_segments(mode="tendon_tension"), LAP, RATE)

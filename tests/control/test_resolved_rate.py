@@ -1,12 +1,12 @@
 """Resolved rates against numpy's pseudo-inverse, and their limits."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refusals
 
 from fastrod.control import ResolvedRate
 from fastrod.errors import InputError
@@ -49,22 +49,16 @@ def test_the_error_is_fed_back_and_shortened() -> None:
 
 def test_the_posture_is_approached_in_the_null_space() -> None:
     q, J, task = case(8)
-    posture, weight = (
-        np.random.default_rng(9).normal(size=12),
-        np.random.default_rng(10).uniform(0.1, 10.0, 12),
-    )
-    for weights in (None, weight):
-        with_posture = ResolvedRate(posture=posture, posture_gain=2.0, weight=weights).rates(
-            q, J, ZERO, task, 0.01
-        )
+    posture = np.random.default_rng(9).normal(size=12)
+    for weights in (None, np.random.default_rng(10).uniform(0.1, 10.0, 12)):
+        control = ResolvedRate(posture=posture, posture_gain=2.0, weight=weights)
+        with_posture = control.rates(q, J, ZERO, task, 0.01)
         without = ResolvedRate(weight=weights).rates(q, J, ZERO, task, 0.01)
         assert_allclose(J @ with_posture, task, atol=1e-12)
         assert np.linalg.norm(with_posture - without) > 0.1
         far = q.copy()
         for _ in range(4000):
-            far += 0.01 * ResolvedRate(posture=posture, posture_gain=2.0, weight=weights).rates(
-                far, J, ZERO, ZERO, 0.01
-            )
+            far += 0.01 * control.rates(far, J, ZERO, ZERO, 0.01)
         # the nearest point to the posture, counted in the weights, with the same task
         w = np.ones(12) if weights is None else weights
         expected = posture + (J.T / w[:, None]) @ np.linalg.solve((J / w) @ J.T, J @ (q - posture))
@@ -81,15 +75,8 @@ def test_no_limit_is_ever_left_and_the_direction_is_kept(size: float, with_postu
         rate, low, high = rng.uniform(0.2, 2.0, 12), np.full(12, -1.0), np.full(12, 1.0)
         q[seed % 12] = rng.choice([-1.0, 1.0])  # one of them at its limit
         posture = rng.uniform(-2.0, 2.0, 12) if with_posture else None
-        control = ResolvedRate(
-            damping=1e-3,
-            lower=low,
-            upper=high,
-            rate=rate,
-            posture=posture,
-            posture_gain=5.0,
-            weight=rng.uniform(0.5, 2.0, 12),
-        )
+        weight, limits = rng.uniform(0.5, 2.0, 12), {"lower": low, "upper": high, "rate": rate}
+        control = ResolvedRate(damping=1e-3, posture=posture, posture_gain=5.0, weight=weight, **limits)
         rates = control.rates(q, J, ZERO, task, 0.05)
         assert (np.abs(rates) <= rate + 1e-12).all()
         assert (q + 0.05 * rates <= high + 1e-12).all()
@@ -121,12 +108,8 @@ def test_the_fraction_is_the_largest_possible() -> None:
         rng = np.random.default_rng(seed)
         J, task = rng.normal(size=(2, 5)), 4.0 * rng.normal(size=2)
         rates = ResolvedRate(damping=0.0, rate=1.0).rates(np.zeros(5), J, np.zeros(2), task, 0.01)
-        best = linprog(
-            [0.0] * 5 + [-1.0],
-            A_eq=np.column_stack([J, -task]),
-            b_eq=[0.0, 0.0],
-            bounds=[(-1.0, 1.0)] * 5 + [(0.0, 1.0)],
-        )
+        A, bounds = np.column_stack([J, -task]), [(-1.0, 1.0)] * 5 + [(0.0, 1.0)]
+        best = linprog([0.0] * 5 + [-1.0], A_eq=A, b_eq=[0.0, 0.0], bounds=bounds)
         fraction = J @ rates @ task / (task @ task)
         assert fraction <= -best.fun + 1e-9
         short += fraction < -0.9 * best.fun
@@ -158,9 +141,8 @@ def test_damping_bounds_the_rates_at_a_singularity_and_only_there() -> None:
 def test_at_a_singularity_limits_are_kept_too() -> None:
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        J = rng.normal(size=(3, 1)) @ rng.normal(size=(1, 6)) + 10.0 ** rng.uniform(-12.0, -1.0) * rng.normal(
-            size=(3, 6)
-        )
+        J = rng.normal(size=(3, 1)) @ rng.normal(size=(1, 6))
+        J = J + 10.0 ** rng.uniform(-12.0, -1.0) * rng.normal(size=(3, 6))
         rates = ResolvedRate(rate=0.3, damping=1e-2).rates(np.zeros(6), J, ZERO, rng.normal(size=3), 0.01)
         assert np.isfinite(rates).all()
         assert (np.abs(rates) <= 0.3).all()
@@ -173,79 +155,44 @@ def test_more_coordinates_than_tasks_or_fewer() -> None:
     assert (np.abs(ResolvedRate(rate=0.01).rates(q, J, np.zeros(6), task, 0.01)) <= 0.01).all()
 
 
-def ask(**changed: Any) -> Any:
-    given: dict[str, Any] = {
-        "q": np.zeros(4),
-        "jacobian": np.ones((3, 4)),
-        "error": ZERO,
-        "feedforward": ZERO,
-        "dt": 0.01,
-    } | changed
-    return ResolvedRate(lower=[-1.0] * 4).rates(**given)
+def ask(**changed: Any) -> Callable[[], Any]:
+    good = {"q": np.zeros(4), "jacobian": np.ones((3, 4)), "error": ZERO, "feedforward": ZERO, "dt": 0.01}
+    return lambda: ResolvedRate(lower=[-1.0] * 4).rates(**(good | changed))
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (
-            lambda: ask(q=np.array([0.0, np.nan, 0.0, 0.0])),
-            "q holds a value that is not finite: [ 0. nan  0.  0.].",
-        ),
-        (
-            lambda: ask(error=np.array([0.0, np.inf, 0.0])),
-            "error holds a value that is not finite: [ 0. inf  0.].",
-        ),
-        (
-            lambda: ask(feedforward=np.array([np.nan] * 3)),
-            "feedforward holds a value that is not finite: [nan nan nan].",
-        ),
-        (
-            lambda: ask(jacobian=np.full((3, 4), np.nan)),
-            "jacobian holds a value that is not finite: [" + "nan " * 8 + "nan].",
-        ),
-        (
-            lambda: ask(error=np.zeros(2)),
-            "q (4,), jacobian (3, 4), error (2,) and feedforward (3,) do not "
-            "fit together; they must be "
-            "(n_q,), (m, n_q), (m,) and (m,).",
-        ),
-        (
-            lambda: ask(q=np.zeros(5), jacobian=np.ones((3, 5))),
-            "q has 5 coordinates; this ResolvedRate is made for 4.",
-        ),
-        (lambda: ask(dt=0.0), "dt is 0.0 s; it must be a number, positive and finite."),
-        (
-            lambda: ResolvedRate(gain=-1.0),
-            "ResolvedRate.gain is -1.0 1/s; it must be a finite number, zero or positive.",
-        ),
-        (
-            lambda: ResolvedRate(error_limit=0.0),
-            "ResolvedRate.error_limit is 0.0 m; it must be a number, positive and finite, or None.",
-        ),
-        (
-            lambda: ResolvedRate(rate=[1.0, 0.0]),
-            "ResolvedRate.rate is [1.0, 0.0]; every number of it must be positive.",
-        ),
-        (
-            lambda: ResolvedRate(weight=[1.0, np.inf]),
-            "ResolvedRate.weight is [1.0, inf]; every number of it must be finite.",
-        ),
-        (
-            lambda: ResolvedRate(lower=[0.0, np.nan]),
-            "ResolvedRate.lower is [0.0, nan]; give (n_q,) numbers, none of them nan.",
-        ),
-        (lambda: ResolvedRate(lower="low"), "ResolvedRate.lower is 'low'; give (n_q,) numbers."),
-        (
-            lambda: ResolvedRate(lower=[0.0], upper=[1.0, 2.0]),
-            "ResolvedRate has lower of 1, upper of 2; they must have one length, n_q.",
-        ),
-        (
-            lambda: ResolvedRate(lower=[0.0, 3.0], upper=[1.0, 2.0]),
-            "ResolvedRate.lower[1] is 3, above upper[1] 2.",
-        ),
-    ],
-)
-def test_refusals(make: Any, sentence: str) -> None:
-    with pytest.raises(InputError) as caught:
-        make()
+def made(**options: Any) -> Callable[[], Any]:
+    return lambda: ResolvedRate(**options)
+
+
+NAN, NOT_FINITE = np.nan, "holds a value that is not finite:"
+REFUSED = {
+    f"q {NOT_FINITE} [ 0. nan  0.  0.].": ask(q=np.array([0.0, NAN, 0.0, 0.0])),
+    f"error {NOT_FINITE} [ 0. inf  0.].": ask(error=np.array([0.0, np.inf, 0.0])),
+    f"feedforward {NOT_FINITE} [nan nan nan].": ask(feedforward=np.array([NAN] * 3)),
+    f"jacobian {NOT_FINITE} [" + "nan " * 8 + "nan].": ask(jacobian=np.full((3, 4), NAN)),
+    (
+        "q (4,), jacobian (3, 4), error (2,) and feedforward (3,) do not fit together; they must be "
+        "(n_q,), (m, n_q), (m,) and (m,)."
+    ): ask(error=np.zeros(2)),
+    "q has 5 coordinates; this ResolvedRate is made for 4.": ask(q=np.zeros(5), jacobian=np.ones((3, 5))),
+    "dt is 0.0 s; it must be a number, positive and finite.": ask(dt=0.0),
+    "ResolvedRate.gain is -1.0 1/s; it must be a finite number, zero or positive.": made(gain=-1.0),
+    "ResolvedRate.error_limit is 0.0 m; it must be a number, positive and finite, or None.": made(
+        error_limit=0.0
+    ),
+    "ResolvedRate.rate is [1.0, 0.0]; every number of it must be positive.": made(rate=[1.0, 0.0]),
+    "ResolvedRate.weight is [1.0, inf]; every number of it must be finite.": made(weight=[1.0, np.inf]),
+    "ResolvedRate.lower is [0.0, nan]; give (n_q,) numbers, none of them nan.": made(lower=[0.0, NAN]),
+    "ResolvedRate.lower is 'low'; give (n_q,) numbers.": made(lower="low"),
+    "ResolvedRate has lower of 1, upper of 2; they must have one length, n_q.": made(
+        lower=[0.0], upper=[1.0, 2.0]
+    ),
+    "ResolvedRate.lower[1] is 3, above upper[1] 2.": made(lower=[0.0, 3.0], upper=[1.0, 2.0]),
+}
+
+
+@refusals({InputError: REFUSED})
+def test_refusals(error: type[Exception], sentence: str, call: Callable[[], object]) -> None:
+    with pytest.raises(error) as caught:
+        call()
     assert str(caught.value) == sentence

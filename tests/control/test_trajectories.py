@@ -1,12 +1,11 @@
 """The paths: velocity is the slope of position, and sizes are what their options say."""
 
-from __future__ import annotations
-
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusals
 
 from fastrod.control import Trajectory, circle, figure_eight, helix, names, square, square_helix, trajectory
 from fastrod.errors import InputError, UnknownNameError
@@ -39,17 +38,13 @@ def test_a_path_in_the_plane_is_closed(name: str) -> None:
     assert np.abs(half).max() > 0.1  # and not before
 
 
-@pytest.mark.parametrize(
-    ("name", "pitch", "lap"), [("helix", 0.1, "circle"), ("square_helix", 0.02, "square")]
-)
-def test_a_helix_is_its_lap_that_sinks_by_the_pitch(name: str, pitch: float, lap: str) -> None:
-    t = np.linspace(-7.0, 45.0, 60)
-    size = {"radius": 0.2} if lap == "circle" else {"side": 0.2}
-    path, flat = trajectory(name, center=CENTER), trajectory(lap, center=CENTER, **size)
+@pytest.mark.parametrize(("name", "pitch"), [("helix", 0.1), ("square_helix", 0.02)])
+def test_a_helix_is_its_lap_that_sinks_by_the_pitch(name: str, pitch: float) -> None:
+    t, path = np.linspace(-7.0, 45.0, 60), trajectory(name, center=CENTER)
+    flat = circle(center=CENTER, radius=0.2) if name == "helix" else square(center=CENTER, side=0.2)
     assert_array_equal(path.position(t)[:, :2], flat.position(t)[:, :2])
-    assert_allclose(
-        path.position(t + 20.0) - path.position(t), np.broadcast_to([0.0, 0.0, -pitch], (60, 3)), atol=1e-12
-    )
+    sunk = np.broadcast_to([0.0, 0.0, -pitch], (60, 3))
+    assert_allclose(path.position(t + 20.0) - path.position(t), sunk, atol=1e-12)
     assert_allclose(path.velocity(t)[:, 2], -pitch / 20.0, rtol=1e-12)
     up = trajectory(name, center=CENTER, downward=False)
     assert_allclose(up.position(t)[:, 2] - CENTER[2], CENTER[2] - path.position(t)[:, 2], atol=1e-12)
@@ -65,14 +60,8 @@ def test_a_triangle_has_three_equal_sides_around_its_centre() -> None:
 
 def test_sizes_are_those_of_the_paper() -> None:
     t = np.linspace(0.0, 20.0, 2001)
-    for path, width in (
-        (square(), 0.4),
-        (circle(), 0.4),
-        (figure_eight(), 0.4),
-        (helix(), 0.4),
-        (square_helix(), 0.2),
-    ):
-        p = path.position(t)
+    for path in (square(), circle(), figure_eight(), helix(), square_helix()):
+        p, width = path.position(t), 0.2 if path.name == "square_helix" else 0.4
         assert_allclose(np.ptp(p[:, 0]), width, rtol=1e-5)
         assert_allclose(np.ptp(p[:, 1]), width, rtol=1e-5)
         assert path.period == 20.0
@@ -83,19 +72,12 @@ def test_sizes_are_those_of_the_paper() -> None:
 
 def test_a_square_has_one_speed_and_at_a_corner_that_of_the_side_that_begins() -> None:
     path = square()
-    assert_allclose(
-        np.linalg.norm(path.velocity(np.linspace(-20.0, 40.0, 777)), axis=-1), 0.4 / 5.0, rtol=1e-12
-    )
-    assert_allclose(
-        path.position([0.0, 5.0, 10.0, 15.0]),
-        [[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0], [-0.2, 0.2, 0]],
-        atol=1e-15,
-    )
-    assert_allclose(
-        path.velocity([0.0, 5.0, 10.0, 15.0, 20.0]),
-        0.08 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0]]),
-        rtol=1e-12,
-    )
+    speed = np.linalg.norm(path.velocity(np.linspace(-20.0, 40.0, 777)), axis=-1)
+    assert_allclose(speed, 0.4 / 5.0, rtol=1e-12)
+    corners = [[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0], [-0.2, 0.2, 0]]
+    assert_allclose(path.position([0.0, 5.0, 10.0, 15.0]), corners, atol=1e-15)
+    begin = 0.08 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0]])
+    assert_allclose(path.velocity([0.0, 5.0, 10.0, 15.0, 20.0]), begin, rtol=1e-12)
     odd = square(period=0.7)
     corners = 0.175 * np.arange(4000)  # where rounding falls on either side
     assert_allclose(np.abs(odd.position(corners)[:, :2]), 0.2, atol=1e-12)
@@ -109,56 +91,33 @@ def test_one_time_or_many() -> None:
     assert path.position(np.empty(0)).shape == (0, 3)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "sentence"),
-    [
-        (lambda: trajectory("sqare"), UnknownNameError, "no trajectory 'sqare'; did you mean 'square'?"),
+MUST = "it must be a number, positive and finite."
+REFUSED = {
+    UnknownNameError: {
+        "no trajectory 'sqare'; did you mean 'square'?": lambda: trajectory("sqare"),
         (
-            lambda: trajectory("spiral", pitch=1.0),
-            UnknownNameError,
-            "no trajectory 'spiral'; known: circle, figure_eight, helix, square, square_helix, triangle.",
+            "no trajectory 'spiral'; known: circle, figure_eight, helix, square, square_helix, triangle."
+        ): lambda: trajectory("spiral", pitch=1.0),
+        "circle has no option 'radios'; did you mean 'radius'?": lambda: trajectory("circle", radios=0.1),
+    },
+    InputError: {
+        f"side of square is -0.1 m; {MUST}": lambda: square(side=-0.1),
+        f"radius of circle is nan m; {MUST}": lambda: circle(radius=np.nan),
+        f"pitch of helix is 0.0 m; {MUST}": lambda: helix(pitch=0.0),
+        f"period of figure_eight is 'long' s; {MUST}": lambda: figure_eight(period="long"),
+        "center of circle is (0.0, 1.0); give three finite numbers, world [m].": lambda: circle(
+            center=(0.0, 1.0)
         ),
-        (
-            lambda: trajectory("circle", radios=0.1),
-            UnknownNameError,
-            "circle has no option 'radios'; did you mean 'radius'?",
-        ),
-        (
-            lambda: square(side=-0.1),
-            InputError,
-            "side of square is -0.1 m; it must be a number, positive and finite.",
-        ),
-        (
-            lambda: circle(radius=np.nan),
-            InputError,
-            "radius of circle is nan m; it must be a number, positive and finite.",
-        ),
-        (
-            lambda: helix(pitch=0.0),
-            InputError,
-            "pitch of helix is 0.0 m; it must be a number, positive and finite.",
-        ),
-        (
-            lambda: figure_eight(period="long"),
-            InputError,
-            "period of figure_eight is 'long' s; it must be a number, positive and finite.",
-        ),
-        (
-            lambda: circle(center=(0.0, 1.0)),
-            InputError,
-            "center of circle is (0.0, 1.0); give three finite numbers, world [m].",
-        ),
-        (lambda: circle().position(np.inf), InputError, "t holds a time that is not finite; give times [s]."),
-        (
-            lambda: circle().velocity("now"),
-            InputError,
-            "t is 'now'; give times [s], a number or an array of them.",
-        ),
-    ],
-)
-def test_refusals(make: Any, error: type[Exception], sentence: str) -> None:
+        "t holds a time that is not finite; give times [s].": lambda: circle().position(np.inf),
+        "t is 'now'; give times [s], a number or an array of them.": lambda: circle().velocity("now"),
+    },
+}
+
+
+@refusals(REFUSED)
+def test_refusals(error: type[Exception], sentence: str, call: Callable[[], object]) -> None:
     with pytest.raises(error) as caught:
-        make()
+        call()
     assert str(caught.value) == sentence
 
 

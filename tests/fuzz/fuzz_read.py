@@ -22,17 +22,8 @@ from fuzz_seeds import KINDS, Originals, write_case, write_fine
 SECONDS, BYTES = 10.0, 2_000_000_000
 """What one file may cost."""
 FINE = ("right", "refused")
-WRONG = (
-    "traceback",
-    "code run",
-    "more than a line",
-    "printed beside",
-    "wrong exit code",
-    "wrong values",
-    "over time",
-    "over memory",
-    "died",
-)
+_HARM = ("traceback", "code run", "over time", "over memory", "died")
+WRONG = (*_HARM, "more than a line", "printed beside", "wrong exit code", "wrong values")
 """What may come of a file, and what may not."""
 
 
@@ -70,10 +61,8 @@ def try_file(index: int, seed: int, folder: Path, originals: Originals) -> Outco
     if verdict in FINE and noise:
         verdict, said = "printed beside", noise
     if verdict in FINE and (seconds > SECONDS or memory > BYTES):
-        verdict, said = (
-            "over time" if seconds > SECONDS else "over memory",
-            f"{seconds:.1f} s, {memory / 1e9:.2f} GB; {said}",
-        )
+        verdict = "over time" if seconds > SECONDS else "over memory"
+        said = f"{seconds:.1f} s, {memory / 1e9:.2f} GB; {said}"
     if canary.exists():
         verdict = "code run"
         canary.rmdir()
@@ -98,18 +87,8 @@ def _read(kind: str, path: Path) -> tuple[str, str]:
 def _policy(path: Path) -> tuple[str, str]:
     from fastrod.commands.cli import main
 
-    words = [
-        "evaluate",
-        "Reach",
-        str(path),
-        "--episodes",
-        "1",
-        "--no-baselines",
-        "--json",
-        "--option",
-        "n_steps=2",
-    ]
-    code = main(words)
+    options = "--episodes 1 --no-baselines --json --option n_steps=2"
+    code = main(["evaluate", "Reach", str(path), *options.split()])
     said = sys.stderr.getvalue().removesuffix("\n") if isinstance(sys.stderr, io.StringIO) else ""
     if code == 0:
         return ("right", "") if not said else ("printed beside", said)
@@ -126,11 +105,7 @@ def _robot(path: Path) -> tuple[str, str]:
         inputs["tension"] = np.full(robot.n_tendons, 0.1)
     state = Simulator(robot, points_per_segment=4).settle(**inputs)
     finite = np.isfinite(state.tip_position[state.ok]).all()
-    return (
-        "right"
-        if finite and set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
-        else "wrong values"
-    ), ""
+    return _right(finite and set(state.problems) == set(np.flatnonzero(~state.ok).tolist()))
 
 
 def _hardware(path: Path) -> tuple[str, str]:
@@ -139,11 +114,7 @@ def _hardware(path: Path) -> tuple[str, str]:
 
     drives = Transmission(load_hardware(path).drives)
     there = drives.counts(np.full(drives.n_drives, 0.001))
-    return (
-        "right"
-        if np.isfinite(drives.dl(there)).all() and np.isfinite(drives.tension(there)).all()
-        else "wrong values"
-    ), ""
+    return _right(np.isfinite(drives.dl(there)).all() and np.isfinite(drives.tension(there)).all())
 
 
 def _log(path: Path) -> tuple[str, str]:
@@ -151,11 +122,7 @@ def _log(path: Path) -> tuple[str, str]:
     from fastrod_scenes.measured import read
 
     log = read(path, load_robot("prototype"))[0]
-    return (
-        "right"
-        if len(log) and not np.isinf(log.dl).any() and not np.isinf(log.tip_position).any()
-        else "wrong values"
-    ), ""
+    return _right(len(log) and not np.isinf(log.dl).any() and not np.isinf(log.tip_position).any())
 
 
 def _mesh(path: Path) -> tuple[str, str]:
@@ -163,7 +130,11 @@ def _mesh(path: Path) -> tuple[str, str]:
 
     made = mesh(path)
     inside = len(made.faces) and made.faces.min() >= 0 and made.faces.max() < len(made.vertices)
-    return ("right" if inside and np.isfinite(made.vertices).all() else "wrong values"), ""
+    return _right(inside and np.isfinite(made.vertices).all())
+
+
+def _right(holds: object) -> tuple[str, str]:
+    return ("right" if holds else "wrong values"), ""
 
 
 _READERS: dict[str, Callable[[Path], tuple[str, str]]] = {
@@ -202,8 +173,7 @@ def _remove(path: Path) -> None:
 
 
 def warm(folder: Path, originals: Originals) -> None:
-    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` where a fine file is
-    not read."""
+    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` on a fine file."""
     for kind in KINDS:
         path = write_fine(kind, folder / "fine", originals)
         with redirect_stdout(io.StringIO()):

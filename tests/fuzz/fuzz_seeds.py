@@ -18,53 +18,16 @@ from typing import Any
 
 import numpy as np
 
-KINDS = (
-    "policy",
-    "robot",
-    "hardware",
-    "log csv",
-    "log parquet",
-    "mesh stl",
-    "mesh stl text",
-    "mesh obj",
-    "mesh ply",
-    "mesh ply text",
-    "mesh off",
-    "mesh glb",
-)
+_MESHES = ("stl", "stl text", "obj", "ply", "ply text", "off", "glb")
+KINDS = ("policy", "robot", "hardware", "log csv", "log parquet", *(f"mesh {name}" for name in _MESHES))
 """What reads a file, and its format: file number k is of kind k modulo their number."""
 _SUFFIX = {"robot": "toml", "hardware": "toml"}
 Rng = np.random.Generator
 Spoil = Callable[[bytes, Rng], bytes]
 
-_ODD = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "1e308",
-    "-1e308",
-    "1e-320",
-    "0",
-    "-0.0",
-    "-1",
-    "1e9",
-    "2147483648",
-    "-9223372036854775809",
-    "9" * 40,
-    "9" * 5000,
-    "true",
-    '""',
-    '"x\\ny"',
-    "[]",
-    "{}",
-    "[[1]]",
-    "''",
-    "0x1p3",
-    "1_0",
-    "7.5",
-    "null",
-)
+_NUMBERS = "nan inf -inf 1e400 1e308 -1e308 1e-320 0 -0.0 -1 1e9 2147483648 -9223372036854775809"
+_OTHERS = 'true "" "x\\ny" [] {} [[1]] \'\' 0x1p3 1_0 7.5 null'
+_ODD = (*_NUMBERS.split(), "9" * 40, "9" * 5000, *_OTHERS.split())
 """What may stand in place of a number."""
 
 
@@ -79,14 +42,8 @@ class Originals:
 
         names = ["t", "run", *(f"dl_{k}" for k in range(1, 5)), "tip_x", "tip_y", "tip_z", "payload"]
         t = np.arange(40) * 0.05
-        numbers = [
-            t,
-            *(0.002 * np.sin(t + k) for k in range(4)),
-            0.01 * np.sin(t),
-            0.01 * np.cos(t),
-            0.068 + 0 * t,
-            0 * t + 0.005,
-        ]
+        tip = 0.01 * np.sin(t), 0.01 * np.cos(t), 0.068 + 0 * t
+        numbers = [t, *(0.002 * np.sin(t + k) for k in range(4)), *tip, 0 * t + 0.005]
         columns: dict[str, Any] = dict(zip([name for name in names if name != "run"], numbers, strict=True))
         columns["run"] = ["a"] * 20 + ["b"] * 20
         rows = "\n".join(",".join(str(columns[name][i]) for name in names) for i in range(len(t)))
@@ -100,9 +57,8 @@ class Originals:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-        two = trimesh.Scene(
-            [ball, trimesh.creation.box(extents=(0.01, 0.01, 0.01)).apply_translation((0.1, 0.0, 0.0))]
-        )
+        cube = trimesh.creation.box(extents=(0.01, 0.01, 0.01)).apply_translation((0.1, 0.0, 0.0))
+        two = trimesh.Scene([ball, cube])
         made = {
             "mesh stl": ball.export(file_type="stl"),
             "mesh stl text": ball.export(file_type="stl_ascii"),
@@ -122,14 +78,11 @@ class Originals:
         folder = files("fastrod") / "robots"
         full = (folder / "prototype.toml").read_text(encoding="utf-8") + (
             '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n[fit]\n"tendon.*.offset" = { sd = 0.001, '
-            "shared = true }\n"
-            "[sensor]\nnoise = [0.001, 0.001, 0.001]\n"
+            "shared = true }\n[sensor]\nnoise = [0.001, 0.001, 0.001]\n"
         )
         hardware = (files("fastrod_device") / "prototype.toml").read_bytes()
-        wide = (
-            b"gear = 21.0\ncounts_per_turn = 4096\ntorque_constant = 0.0251\nrated_torque = "
-            b"0.054\nefficiency = 0.8\n"
-        )
+        wide = b"gear = 21.0\ncounts_per_turn = 4096\ntorque_constant = 0.0251\n"
+        wide += b"rated_torque = 0.054\nefficiency = 0.8\n"
         shipped = tuple((folder / f"{name}.toml").read_bytes() for name in robot_names())
         return {"robot": (*shipped, full.encode()), "hardware": (hardware, hardware + wide)}
 
@@ -251,14 +204,8 @@ def _double(data: bytes, rng: Rng) -> bytes:
 def _large(data: bytes, rng: Rng) -> bytes:
     """Four or eight bytes become the largest or the most negative number there is."""
     start, _ = _span(data, rng)
-    most = (
-        b"\xff" * 4,
-        b"\xff\xff\xff\x7f",
-        b"\x00\x00\x00\x80",
-        b"\xff" * 8,
-        b"\x00\x00\xc0\x7f",
-        b"\x00\x00\x80\x7f",
-    )
+    whole = b"\xff" * 4, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8
+    most = (*whole, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f")
     piece = most[rng.integers(len(most))]
     return data[:start] + piece + data[start + len(piece) :]
 
@@ -349,12 +296,9 @@ def npz(arrays: Mapping[str, Any], *, compress: bool = False) -> bytes:
 def foreign(canary: Path) -> bytes:
     """A file of stable-baselines3 whose pickles make `canary`."""
     word = {":type:": "<class 'x'>", ":serialized:": base64.b64encode(pickle.dumps(_Code(canary))).decode()}
-    data = json.dumps(
-        dict.fromkeys(("policy_class", "observation_space", "action_space", "policy_kwargs"), word)
-    )
-    out = io.BytesIO()
+    names, out = ("policy_class", "observation_space", "action_space", "policy_kwargs"), io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("data", data)
+        archive.writestr("data", json.dumps(dict.fromkeys(names, word)))
         archive.writestr("policy.pth", pickle.dumps(_Code(canary)))
     return out.getvalue()
 
@@ -375,10 +319,8 @@ def _hostile(kind: str, data: bytes, canary: Path, originals: Originals) -> dict
     if kind == "mesh glb":
         made |= {name: partial(_glb, data, change) for name, change in _GLB.items()}
     if kind.startswith("mesh"):
-        made |= {
-            name: partial(text.encode)
-            for name, text in _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {}).items()
-        }
+        bombs = _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {})
+        made |= {name: partial(text.encode) for name, text in bombs.items()}
     return made
 
 
@@ -395,8 +337,7 @@ _BOMBS: Mapping[str, Mapping[str, str]] = {
     },
     "stl": {
         "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 "
-        "0\n"
-        "endloop\nendfacet\nendsolid\n" * 5000,
+        "0\nendloop\nendfacet\nendsolid\n" * 5000,
         "half a facet": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0\n",
     },
     "ply": {
@@ -453,10 +394,8 @@ def _many_rows() -> bytes:
     import pyarrow.parquet
 
     one, out = pyarrow.array(np.zeros(20_000_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(
-        pyarrow.table(dict.fromkeys(("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4"), one)),
-        out,
-    )
+    names = ("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4")
+    pyarrow.parquet.write_table(pyarrow.table(dict.fromkeys(names, one)), out)
     return out.getvalue()
 
 
@@ -464,13 +403,11 @@ def _long_words() -> bytes:
     import pyarrow
     import pyarrow.parquet
 
-    word = pyarrow.DictionaryArray.from_arrays(
-        pyarrow.array(np.zeros(100_000, np.int32)), pyarrow.array(["x" * 1_000_000])
-    )
+    places, words = pyarrow.array(np.zeros(100_000, np.int32)), pyarrow.array(["x" * 1_000_000])
     zeros, out = pyarrow.array(np.zeros(100_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(
-        pyarrow.table({"run": word, **dict.fromkeys(("t", "tip_x", "tip_y", "tip_z"), zeros)}), out
-    )
+    columns = {"run": pyarrow.DictionaryArray.from_arrays(places, words)}
+    columns |= dict.fromkeys(("t", "tip_x", "tip_y", "tip_z"), zeros)
+    pyarrow.parquet.write_table(pyarrow.table(columns), out)
     return out.getvalue()
 
 
@@ -558,10 +495,8 @@ def _header(arrays: dict[str, Any], rng: Rng, _: Path) -> bytes:
         for name, a in arrays.items():
             held = io.BytesIO()
             np.save(held, a)
-            data = held.getvalue()
-            archive.writestr(
-                f"{name}.npy", _TEXT[sorted(_TEXT)[rng.integers(len(_TEXT))]](data[:128], rng) + data[128:]
-            )
+            data, spoil = held.getvalue(), _TEXT[sorted(_TEXT)[rng.integers(len(_TEXT))]]
+            archive.writestr(f"{name}.npy", spoil(data[:128], rng) + data[128:])
     return out.getvalue()
 
 
@@ -581,9 +516,7 @@ _ARRAYS: Mapping[str, Callable[[dict[str, Any], Rng, Path], bytes | None]] = {
     "header": _header,
     "huge shape": _huge,
     "missing": _drop,
-    "objects": lambda arrays, rng, canary: _spoil_array(
-        arrays, rng, lambda _: np.array([_Code(canary)], dtype=object)
-    ),
+    "objects": lambda arrays, rng, canary: _spoil_array(arrays, rng, lambda _: np.array([_Code(canary)])),
     "doubles": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a.astype(float)),
     "words": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a.astype(str)),
     "shape": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a[:-1]),

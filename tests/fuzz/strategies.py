@@ -1,5 +1,4 @@
-"""What the fuzz tests share: how often they try, odd values, mutations of tables and texts, and what a
-sentence is."""
+"""What the fuzz tests share: settings, odd values, mutations of tables and texts, what a sentence is."""
 
 from __future__ import annotations
 
@@ -24,63 +23,25 @@ SLOW = [
 
 def tried(times: int) -> settings:
     """The same `times` examples on every machine."""
-    return settings(
-        derandomize=True, deadline=None, max_examples=times, database=None, suppress_health_check=SLOW
-    )
+    always: Any = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": SLOW}
+    return settings(max_examples=times, **always)
 
 
 LONGEST = 1500
 """Characters of a sentence that still can be read."""
 
+ORDINARY = [0.0, -0.0, 1.0, -1.0, math.nan, math.inf, -math.inf, 5e-324, 1e-300, 1e-30, 1e-12, 1e-3, 0.5]
+LARGE = [90.0, 1e3, 1e9, 1e154, 1e300, 1.7e308]
 odd_numbers = st.one_of(
-    st.sampled_from(
-        [
-            0.0,
-            -0.0,
-            1.0,
-            -1.0,
-            math.nan,
-            math.inf,
-            -math.inf,
-            5e-324,
-            1e-300,
-            1e-30,
-            1e-12,
-            1e-3,
-            0.5,
-            90.0,
-            1e3,
-            1e9,
-            1e154,
-            1e300,
-            1.7e308,
-        ]
-    ),
+    st.sampled_from([*ORDINARY, *LARGE]),
     st.sampled_from([0, 1, -1, 2, 70, 10**9, 2**63, 10**25, 10**400]),
     st.floats(),
     st.floats(1e-6, 1.0),
     st.integers(-3, 12),
 )
+WORDS = "paper passive tendon_tension tendon_length payload 0.07 nan ß \u202e \0"
 odd_words = st.one_of(
-    st.sampled_from(
-        [
-            "",
-            " ",
-            "paper",
-            "passive",
-            "tendon_tension",
-            "tendon_length",
-            "payload",
-            "0.07",
-            "nan",
-            "ß",
-            "\u202e",
-            "\0",
-            "a\nb",
-            "💥",
-            "é" * 50,
-        ]
-    ),
+    st.sampled_from(["", " ", *WORDS.split(" "), "a\nb", "💥", "é" * 50]),
     st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
 )
 odd_leaves = st.one_of(
@@ -100,17 +61,12 @@ odd_values = st.recursive(
 
 
 def is_sentence(error: BaseException) -> bool:
-    """Whether this error is told in one line that ends, and that nobody else's words stand in place of
-    ours."""
+    """Whether this error is one line that ends, in our own words."""
     text = str(error)
     foreign = ("Traceback", "msgspec", "numpy", "ndarray", "object of type", "tuple index", "NoneType")
-    return (
-        0 < len(text) <= LONGEST
-        and "\n" not in text
-        and "\r" not in text
-        and text.rstrip()[-1] in ".?!)"
-        and not any(w in text for w in foreign)
-    )
+    if not 0 < len(text) <= LONGEST or text.rstrip()[-1] not in ".?!)":
+        return False
+    return not any(word in text for word in ("\n", "\r", *foreign))
 
 
 def one_sentence(error: BaseException, *names: str) -> None:
@@ -133,12 +89,6 @@ SECTIONS: dict[str, Any] = {
         "latency_sd": 0.1,
     },
     "effect": [{"name": "backlash", "half_width": 0.0002}, {"name": "payload", "mass": 0.01}],
-}
-numbers_of = {
-    "name": "x",
-    "length": 0.07,
-    "bending_stiffness": [0.0022, 0.0022],
-    "torsional_stiffness": 0.001,
 }
 
 
@@ -164,14 +114,9 @@ def good_tables(draw: st.DrawFn) -> dict[str, Any]:
                 "mode": mode,
             }
             if mode != "passive":
-                tendon = st.fixed_dictionaries(
-                    {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)},
-                    optional={
-                        "compliance": st.floats(0.0, 1e-3),
-                        "pretension": st.floats(0.0, 5.0),
-                        "unilateral": st.booleans(),
-                    },
-                )
+                place = {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)}
+                more = {"compliance": st.floats(0.0, 1e-3), "pretension": st.floats(0.0, 5.0)}
+                tendon = st.fixed_dictionaries(place, optional=more | {"unilateral": st.booleans()})
                 segment["tendons"] = draw(st.lists(tendon, min_size=1, max_size=4))
             table["segment"].append(segment)
     for name in draw(st.lists(st.sampled_from(sorted(SECTIONS)), unique=True, max_size=3)):
@@ -185,23 +130,10 @@ def _places(node: Any) -> list[tuple[Any, Any]]:
     return [place for key, value in items for place in [(node, key), *_places(value)]]
 
 
-KEYS = [
-    "name",
-    "segment",
-    "lenght",
-    "length",
-    "tendons",
-    "offset",
-    "mode",
-    "youngs_modulus",
-    "second_moment",
-    "gravity",
-    "points",
-    "sd",
-    "",
-    "é",
-    "half_width",
-]
+KEYS = "name segment lenght length tendons offset mode youngs_modulus second_moment gravity points sd"
+
+keys = st.sampled_from([*KEYS.split(), "", "é", "half_width"]) | odd_words
+CHANGES = "put put number number drop add rename wrap empty twice"
 
 
 @st.composite
@@ -213,11 +145,7 @@ def mutated_tables(draw: st.DrawFn) -> dict[str, Any]:
         if not places:
             break
         node, key = places[draw(st.integers(0, len(places) - 1))]
-        match draw(
-            st.sampled_from(
-                ["put", "put", "number", "number", "drop", "add", "rename", "wrap", "empty", "twice"]
-            )
-        ):
+        match draw(st.sampled_from(CHANGES.split())):
             case "put":
                 node[key] = draw(odd_values)
             case "number":
@@ -225,9 +153,9 @@ def mutated_tables(draw: st.DrawFn) -> dict[str, Any]:
             case "drop":
                 del node[key]
             case "add" if isinstance(node, dict):
-                node[draw(st.sampled_from(KEYS) | odd_words)] = draw(odd_values)
+                node[draw(keys)] = draw(odd_values)
             case "rename" if isinstance(node, dict):
-                node[draw(st.sampled_from(KEYS) | odd_words)] = node.pop(key)
+                node[draw(keys)] = node.pop(key)
             case "wrap":
                 node[key] = [node[key]]
             case "empty":
@@ -244,6 +172,9 @@ def written(table: dict[str, Any]) -> str:
     return tomli_w.dumps(table)
 
 
+ODD_BYTES = [b'"""', b"[[", b"]", b"\r\n", b"\xef\xbb\xbf", b"=", b"nan", b"-inf", b",", b'"']
+
+
 @st.composite
 def broken_texts(draw: st.DrawFn, text: str) -> bytes:
     """A text cut, doubled, with bytes put in and taken out."""
@@ -258,16 +189,7 @@ def broken_texts(draw: st.DrawFn, text: str) -> bytes:
             case "double":
                 raw = raw[:end] + raw[start:]
             case "insert":
-                raw = (
-                    raw[:start]
-                    + draw(
-                        st.binary(max_size=8)
-                        | st.sampled_from(
-                            [b'"""', b"[[", b"]", b"\r\n", b"\xef\xbb\xbf", b"=", b"nan", b"-inf", b",", b'"']
-                        )
-                    )
-                    + raw[start:]
-                )
+                raw = raw[:start] + draw(st.binary(max_size=8) | st.sampled_from(ODD_BYTES)) + raw[start:]
             case "byte" if raw:
                 at = min(start, len(raw) - 1)
                 raw = raw[:at] + bytes([draw(st.integers(0, 255))]) + raw[at + 1 :]

@@ -26,8 +26,7 @@ def loaded(path: Path) -> Robot | None:
 
 
 def simulated(robot: Robot, path: Path) -> None:
-    """Settle a robot at rest, and step it: finite where ok, a reason where not; no warning and no other
-    error."""
+    """Settle a robot at rest, and step it: finite where ok, a reason where not; no other error."""
     modes = {segment.mode for segment in robot.segments}
     inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length}
     if "tendon_tension" in modes:
@@ -67,7 +66,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_good_robot_is_read_written_and_simulated(path: Path, table: dict[str, Any]) -> None:
     path.write_text(written(table), encoding="utf-8")
     robot = loaded(path)
-    if robot is None:  # the wires of a made-up robot may not fit its segments
+    if robot is None:  # the tendons of a made-up robot may not fit its segments
         return
     save_robot(robot, path)
     assert dumps(load_robot(path)) == dumps(robot)

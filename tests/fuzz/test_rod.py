@@ -1,5 +1,4 @@
-"""Any values at all as a rod's inputs, on a base anywhere: a state, or one sentence; and what was refused has
-changed nothing."""
+"""Any values at all as a rod's inputs, on a base anywhere: a state, or one sentence that changed nothing."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ HOME, STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (0.0,) * 6
 FIELDS = ("position", "tip_position", "base_wrench", "ok", "passes")
 
 some = st.one_of(odd_values, st.lists(st.one_of(st.floats(-0.1, 0.1), st.floats()), min_size=1, max_size=8))
-"""A value for anything: mostly no vector at all, or one of a wrong length, or with a number in it that is
-none."""
+"""A value for anything: mostly no vector, or one of a wrong length, or with a number that is none."""
 
 
 @cache

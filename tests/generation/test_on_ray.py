@@ -39,8 +39,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_killed_ray_worker_loses_and_doubles_nothing(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool
 ) -> None:
-    """A worker that kills itself in its sixth shard, before or after writing it: none has to be caught at
-    work."""
+    """A worker that kills itself in its sixth shard, before or after writing it."""
     from fastrod.generation import on_ray
 
     mark = tmp_path / "killed"
@@ -91,8 +90,7 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
     monkeypatch.setattr(on_ray, "_write_probe", write_probe)
     with pytest.raises(
         InputError,
-        match=r"machine .* does not see folder .*shards'; give --out a folder "
-        r"that all machines see\.",
+        match=r"machine .* does not see folder .*shards'; give --out a folder that all machines see\.",
     ):
         generate(small(), tmp_path, ray="auto")
     assert bits(tmp_path) == {}

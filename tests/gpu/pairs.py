@@ -1,4 +1,4 @@
-"""The same simulator on both machines, what it is told, and how near its numbers must be."""
+"""The same simulator on both machines, what it is commanded, and how near its numbers must be."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def pair(robot: Robot | Sequence[Robot], n: int | None = 3, **options: Any) -> l
 
 
 def inputs(robot: Robot, k: int, n: int = 3) -> dict[str, Any]:
-    """What the robots are told at step k: lengths or tensions, and from step 2 on a tip force that moves."""
+    """What the robots are given at step k: lengths or tensions, and from step 2 on a tip force that moves."""
     angle = 0.2 * np.arange(1, n + 1)[:, None] * (1.0, -0.6) + 0.01 * k
     given: dict[str, Any] = {"tip_force": np.outer(np.linspace(0.5, 1.0, n), (0.01, 0.02, -0.01)) * max(k, 1)}
     modes = {segment.mode for segment in robot.segments}

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from identification.logs import log_of, one_segment
+from identification.logs import bare_run, log_of, one_segment
 from numpy.testing import assert_allclose
 from rods import rod
 
-from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.search.residual_test import ResidualStructure, residual_structure
 from fastrod.model.routing import route
@@ -21,10 +19,7 @@ RATE, SIZE = 8.0, 0.9
 
 @cache
 def samples() -> LogSamples:
-    """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one
-    base."""
-    run = excitation(one_segment(), rate=RATE).log
-    return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
+    return bare_run(RATE)
 
 
 N, DT = len(samples().log), 1.0 / RATE
@@ -109,11 +104,8 @@ def test_shares_are_of_the_variance() -> None:
     """In whatever unit; and nothing has no share of anything."""
     residual = planted(patterns()["static"], 0.5, 0)
     one, other = run(residual), run(1e-4 * residual)
-    assert_allclose(
-        [other.static, other.memory, other.drift, other.exogenous],
-        [one.static, one.memory, one.drift, one.exogenous],
-        atol=1e-9,
-    )
+    for kind in ("static", "memory", "drift", "exogenous"):
+        assert_allclose(getattr(other, kind), getattr(one, kind), atol=1e-9)
     nothing = run(np.zeros((N, 3)))
     assert (nothing.structured, nothing.kind, nothing.z) == (0.0, "none", 0.0)
 
@@ -124,7 +116,5 @@ def test_only_some_rows_and_a_robot_without_wires() -> None:
     assert residual_structure(few, route(one_segment()), residual).kind == "static"
     passive = sample(log_of(rod("passive"), np.zeros((N, 0)), DT))
     assert residual_structure(passive, route(rod("passive")), noise(1)).kind == "none"
-    assert (
-        residual_structure(passive, route(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind
-        == "drift"
-    )
+    drift = planted(patterns()["drift"], 0.5, 1)
+    assert residual_structure(passive, route(rod("passive")), drift).kind == "drift"

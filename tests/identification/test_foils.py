@@ -1,4 +1,5 @@
-"""Foils against patterns that another program made: each family is the best name for its own."""
+"""Alternative patterns against patterns that another program made: each family is the best name for its
+own."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import PredictedRod, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
-from fastrod.identification.search.linearised import LinearisedModel, Target
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.model.robotfile import load_robot
 
 NOISE = 3e-4  # m
@@ -54,7 +55,7 @@ def linearised() -> LinearisedModel:
         model.start,
         samples,
         PredictedRod(samples, robot, threads=1),
-        Target(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False),
+        target_of(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False),
     )
 
 
@@ -143,7 +144,8 @@ def test_times_and_frequencies_are_those_that_were_planted() -> None:
 
 
 def test_of_noise_no_family_makes_anything() -> None:
-    """The BIC of the best of seven families, scans counted, is above that of the model without a foil."""
+    """The BIC of the best of seven families, scans counted, is above that of the model without an alternative
+    pattern."""
     white = residual(np.zeros((len(inputs().t), 3)))
     nothing = white.size * np.log(left_by(np.zeros((*white.shape, 0)), white) / white.size)
     assert ranked(white)[0][0] > nothing - 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 
 import fastrod.effects.base as registry
 from fastrod import Robot, Simulator
-from fastrod.effects.base import Parameter, Seam, Signal, effect, get_effect, has_memory, signal_of
+from fastrod.effects.base import Parameter, Seam, Signal, Static, effect, get_effect, has_memory, signal_of
 from fastrod.effects.ports import EffectPorts
+from fastrod.errors import EffectError
 from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route
 from fastrod.types import Floats
@@ -230,22 +232,58 @@ class Sluggish:
         ports.shift_tendons(memory - dl)
 
 
+class Poke(Static):
+    """A force on the backbone, half way.
+
+    Equation: F at l/2
+    Source: this test
+    Residual signature: bend
+    """
+
+    frame: ClassVar[Any] = "world"
+    seam = Seam.LOAD
+    parameters = (Parameter("force", "N", typical=0.05),)
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        half = 0.5 * ports.routing.length.sum()
+        ports.add_point_force(half, values * np.array([0.0, 1.0, 0.0]), self.frame)
+
+
 @pytest.fixture
-def sluggish() -> Iterator[str]:
+def strangers() -> Iterator[None]:
     registry.load_library()
     before = dict(registry._REGISTRY)
     effect(Sluggish)
-    yield "sluggish"
+    effect(Poke)
+    yield
     registry._REGISTRY.clear()
     registry._REGISTRY.update(before)
 
 
-def test_a_users_effect_without_a_sweep_goes_step_by_step(sluggish: str) -> None:
+@pytest.mark.usefixtures("strangers")
+def test_a_users_effect_without_a_sweep_goes_step_by_step() -> None:
     """Between the library's, one before it and one after."""
     tables = [{"name": name} | TABLES[name] for name in ("backlash", "plastic_set")]
-    robot = having(two_segments(), {"name": sluggish, "tau": 0.2}, *tables)
+    robot = having(two_segments(), {"name": "sluggish", "tau": 0.2}, *tables)
     what = log(robot)
     found = predicted(robot, what)
     assert_alike(found, stepped(robot, what), robot.length)
     assert np.abs(found.position - predicted(having(two_segments(), *tables), what).position).max() > 1e-3
-    assert registry.columns(get_effect(sluggish), route(robot)) == ["tau"]
+    assert registry.columns(get_effect("sluggish"), route(robot)) == ["tau"]
+
+
+@pytest.mark.usefixtures("strangers")
+def test_a_point_force_over_a_log_is_the_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the world's frame; one that turns with the rod needs a state, and a log carries none."""
+    robot = having(two_segments(), {"name": "poke", "force": 0.1}, {"name": "backlash"} | TABLES["backlash"])
+    what = log(robot)
+    found = predicted(robot, what)
+    assert_alike(found, stepped(robot, what), robot.length)
+    assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4
+    samples, model = sample(what), base_model(two_segments())
+    rod = PredictedRod(samples, model.robot)
+    target = target_of(samples, np.full(3, 1e-4), rotation_sigma=0.01, points=False)
+    assert not LinearisedModel(model, model.start, samples, rod, target).is_light("poke")
+    monkeypatch.setattr(Poke, "frame", "material")
+    with pytest.raises(EffectError, match="material frame goes by the last shape; over a log no state"):
+        predicted(robot, what)

@@ -11,7 +11,7 @@ from rods import rod
 
 from fastrod import load_robot
 from fastrod.identification.log.forward import LogSamples, sample
-from fastrod.identification.log.limits import limits
+from fastrod.identification.report.assemble import limits
 
 
 def moving(rate: float) -> LogSamples:
@@ -27,8 +27,8 @@ def test_a_thick_beam_shears() -> None:
     (segment,) = robot.segments
     assert f"{robot.length / (2.0 * segment.body_radius):.1f} times as long as thick" in said
     fraction = 9.0 / (4.0 * 0.9) * (segment.body_radius / robot.length) ** 2
-    told = float(said.split("some ")[1].split(" %")[0]) / 100.0
-    assert told == pytest.approx(fraction, rel=0.1, abs=0.006)  # told in whole percents
+    reported = float(said.split("some ")[1].split(" %")[0]) / 100.0
+    assert reported == pytest.approx(fraction, rel=0.1, abs=0.006)  # reported in whole percents
 
 
 def test_a_slender_weightless_rod_has_no_limits() -> None:

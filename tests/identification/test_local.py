@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from fastrod import Robot
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import Model, base_model
-from fastrod.identification.search.linearised import LinearisedModel, Target, exact_residual
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 
 N = 40
 SIGMA = np.array([2e-4, 3e-4, 4e-4])
@@ -57,13 +58,13 @@ class Place:
         self.theta = self.model.start
         self.samples = samples()
         self.rod = PredictedRod(self.samples, self.model.robot, points=True)
-        self.target = Target(self.samples, SIGMA, rotation_sigma=0.01, points=True)
+        self.target = target_of(self.samples, SIGMA, rotation_sigma=0.01, points=True)
         self.linearised = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
 
     def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
-        residual, ok = exact_residual(model, theta, self.samples, self.rod, self.target)
-        assert ok.all()
-        return residual
+        pose = predict(model, theta, self.samples, self.rod)
+        assert pose.ok.all()
+        return self.target.residual(pose)
 
 
 @cache
@@ -101,7 +102,7 @@ def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.nda
 
 # What a local slope may be off by, as a share of the exact one (root mean square over rows and numbers seen):
 # wires go through the rod by one-sided differences of 2 mrad, the camera by none;
-WIRES = dict.fromkeys(
+TENDONS = dict.fromkeys(
     ["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004
 )
 CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
@@ -120,7 +121,7 @@ MEMORY = {
     "dynamics": 0.15,
 }
 # what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
-# that. Wires that stretch
+# that. Tendons that stretch
 # by thirty times their compliance here do so by a third.
 ROD = {
     "gravity": 0.07,
@@ -188,17 +189,17 @@ def test_slopes_of_the_base_parameters() -> None:
         here.model,
         here.theta,
         0,
-        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA},
+        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **TENDONS, **CAMERA},
     )
 
 
-@pytest.mark.parametrize("name", [*WIRES, *CAMERA, *FORCE, *MEMORY])
+@pytest.mark.parametrize("name", [*TENDONS, *CAMERA, *FORCE, *MEMORY])
 def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
     before = here.rod.runs
     here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
     assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
-    assert_slopes(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
+    assert_slopes(here, model, theta, first, TENDONS | CAMERA | FORCE | MEMORY)
 
 
 @pytest.mark.parametrize("name", ROD)
@@ -244,12 +245,18 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     true[place] = 0.03
     pose = predict(here.model, true, here.samples, here.rod)
     log = here.samples.log
-    told = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
-    told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
-    told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
+    reported = replace(
+        target_of(here.samples, SIGMA, rotation_sigma=0.01, points=False),
+        tip=pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3)),
+        rotation=None,
+    )
     assert len(log) == N
     linearised = LinearisedModel(
-        here.model, here.theta, here.samples, PredictedRod(here.samples, here.model.robot, points=True), told
+        here.model,
+        here.theta,
+        here.samples,
+        PredictedRod(here.samples, here.model.robot, points=True),
+        reported,
     )
     fit = linearised.fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
@@ -261,8 +268,8 @@ def test_a_local_fit_finds_what_was_planted() -> None:
 def test_rows_that_do_not_count() -> None:
     """Outliers and rows that did not converge have no residual and no slope."""
     here = base()
-    target = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
-    target.weight = np.where(np.arange(N) == 7, 0.0, 1.0)
+    target = target_of(here.samples, SIGMA, rotation_sigma=0.01, points=True)
+    target = replace(target, weight=np.where(np.arange(N) == 7, 0.0, 1.0))
     pose = predict(here.model, here.theta, here.samples, here.rod)
     ok = pose.ok.copy()
     ok[9] = False

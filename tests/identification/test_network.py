@@ -39,9 +39,9 @@ def left(residual: np.ndarray) -> tuple[float, float]:
     result = SimpleNamespace(
         residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
     )
-    told = residual_network(here, route(one_segment()), result)
-    assert told["inputs"] > 4
-    return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), told["held_out_rms_m"]
+    reported = residual_network(here, route(one_segment()), result)
+    assert reported["inputs"] > 4
+    return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), reported["held_out_rms_m"]
 
 
 def noise() -> np.ndarray:

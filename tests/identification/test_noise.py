@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from identification.logs import log_of, one_segment, wires
+from identification.logs import displacement_of, log_of, one_segment
 from numpy.testing import assert_allclose
 
 from fastrod.identification.log.forward import LogSamples, sample
@@ -28,7 +28,7 @@ def samples(n: int = N, *, rests: bool = True) -> LogSamples:
             moving[part] = 0.0
     angle = np.cumsum(moving) / RATE
     bends = 0.8 * np.stack([np.sin(1.3 * angle), np.sin(0.9 * angle)], axis=1)[:, None]
-    return sample(log_of(robot, wires(robot, bends), 1.0 / RATE))
+    return sample(log_of(robot, displacement_of(robot, bends), 1.0 / RATE))
 
 
 def smooth(seed: int, n: int = N) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""An effect in a package of its own: what identification knows of effects, it knows of this one without an
-edit."""
+"""An effect in a package of its own: identification knows it as it knows the library's."""
 
 from __future__ import annotations
 
@@ -58,13 +57,10 @@ class WornCable(Static):
 def package(tmp_path: Path) -> Iterator[None]:
     """The package as it lies once it is installed: one file, and its entry point."""
     (tmp_path / "wornlab.py").write_text(CABLE)
-    (tmp_path / "wornlab-1.0.dist-info").mkdir()
-    (tmp_path / "wornlab-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: wornlab\nVersion: 1.0\n"
-    )
-    (tmp_path / "wornlab-1.0.dist-info" / "entry_points.txt").write_text(
-        "[fastrod.effects]\nworn = wornlab\n"
-    )
+    info = tmp_path / "wornlab-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: wornlab\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[fastrod.effects]\nworn = wornlab\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
         base.load_library.cache_clear()
@@ -89,11 +85,8 @@ def test_a_search_tries_it_where_the_robot_can_show_it(package: None) -> None:
 
 
 def test_the_run_that_separates_it_is_its_own(package: None) -> None:
-    words = "to tell worn cable from creep: an hour of rest"
-    assert separating_run("worn_cable", "creep") == words
-    assert separating_run("creep", "worn_cable") == words.replace(
-        "worn cable from creep", "creep from worn cable"
-    )
+    assert separating_run("worn_cable", "creep") == "to tell worn cable from creep: an hour of rest"
+    assert separating_run("creep", "worn_cable") == "to tell creep from worn cable: an hour of rest"
     assert "after an hour; " in separating_run("worn_cable", "gravity")
 
 
@@ -102,20 +95,11 @@ def test_a_report_draws_it_against_its_signal(package: None) -> None:
     dl = wave(robot, 200)
     seen = np.column_stack([dl[:, :2], np.full(len(dl), robot.length)])
     log = log_of(robot, dl, tip_position=seen)
-    result: Any = SimpleNamespace(
-        robot=robot,
-        log=log,
-        measured=np.ones(len(log), bool),
-        outlier=np.zeros(len(log), bool),
-        before=seen,
-        after=seen,
-        residual_before=0.001 * np.sin(seen),
-        residual_after=0.0 * seen,
-    )
-    found = Found(
-        name="worn_cable", title="", parameters={}, held_out_gain=1.0, evidence={}, cannot_be_told_from=[]
-    )
-    view = Signals(result).view(found)
+    left = {"residual_before": 0.001 * np.sin(seen), "residual_after": 0.0 * seen}
+    rows = {"measured": np.ones(len(log), bool), "outlier": np.zeros(len(log), bool)}
+    result: Any = SimpleNamespace(robot=robot, log=log, before=seen, after=seen, **left, **rows)
+    usual: Any = {"title": "", "held_out_gain": 1.0, "evidence": {}, "cannot_be_told_from": []}
+    view = Signals(result).view(Found(name="worn_cable", parameters={}, **usual))
     assert view.signal_label == "time since the start of the run [s]"
     assert len(view.rows) == len(log)
 
@@ -127,8 +111,7 @@ def test_its_bound_is_among_the_first(package: None) -> None:
 
 
 def test_every_law_of_the_library_has_what_it_had() -> None:
-    """Which signal, how many segments and which rank are theirs: by seam and memory unless a law says its
-    own."""
+    """Signal, segments and rank are by seam and memory unless a law says its own."""
     own = {name: signal_of(get_effect(name)) for name in effect_names() if trait(get_effect(name), "signal")}
     assert own == {
         "creep": Signal.LAG,

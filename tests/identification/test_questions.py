@@ -251,12 +251,12 @@ def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: An
     run = farlog.log(300)
     Path("flipped.csv").write_text(farlog.csv(run._replace(dl=-run.dl)))
     assert main(["replay", "flipped.csv", "--robot", "mine.toml"]) == 0
-    told = capsys.readouterr()
-    assert "excursion" in told.out
+    reported = capsys.readouterr()
+    assert "excursion" in reported.out
     assert re.search(
-        r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", told.err
+        r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", reported.err
     )
-    assert len(told.err.splitlines()) == 1
+    assert len(reported.err.splitlines()) == 1
     rest = np.asarray(ROBOT.rest_tendon_length)
     Path("absolute.csv").write_text(farlog.csv(run._replace(dl=run.dl + rest)))
     for command in ("replay", "identify"):

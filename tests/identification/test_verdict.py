@@ -30,23 +30,15 @@ RIPPLE = AlternativePattern("ripple", "static", "periodic", np.zeros((1, 3, 2)),
 
 
 def took(alternative: AlternativePattern | None, name: str = "backlash") -> SearchStep:
-    """A stage that took a foil, or an effect."""
+    """A stage that took an alternative pattern, or an effect."""
     taken = Candidate(alternative.name if alternative else name, None, 9.0, 99.0, 0.5, 1, "", alternative)
     return SearchStep(None, (), taken)
 
 
 def grounds(**changed: Any) -> VerdictGrounds:
-    given = {
-        "base": BASE,
-        "library": BASE,
-        "after": BASE,
-        "floor": FLOOR,
-        "left_out": 0.0,
-        "structure": CLEAN,
-        "steps": [],
-        "found": [],
-    }
-    made = choose_verdict(**(given | changed))
+    errors = {"base": BASE, "library": BASE, "after": BASE, "floor": FLOOR, "left_out": 0.0}
+    given = {"structure": CLEAN, "steps": [], "found": []}
+    made = choose_verdict(**errors | given | changed)
     assert made.verdict in get_args(Verdict)
     assert made.kind in KINDS
     assert 0.0 <= made.left <= 1.0
@@ -57,25 +49,14 @@ def grounds(**changed: Any) -> VerdictGrounds:
 
 def found(left: float, **changed: Any) -> VerdictGrounds:
     """Backlash, with a static structure that carries `left` of the error above the noise."""
-    after = 0.5
-    return grounds(
-        library=after,
-        after=after,
-        structure=ResidualStructure(left / after, 0.0, 0.0, 0.0, 5.0),
-        found=["backlash"],
-        **changed,
-    )
+    structure = ResidualStructure(left / 0.5, 0.0, 0.0, 0.0, 5.0)
+    return grounds(library=0.5, after=0.5, structure=structure, found=["backlash"], **changed)
 
 
 def test_a_residual_of_noise_is_none() -> None:
     made = grounds(base=1.02 * FLOOR, library=1.02 * FLOOR, after=1.02 * FLOOR)
-    assert (made.verdict, made.kind, made.left, made.patterns, made.drop_effects) == (
-        "none",
-        "none",
-        0.0,
-        (),
-        False,
-    )
+    assert (made.verdict, made.kind, made.left) == ("none", "none", 0.0)
+    assert (made.patterns, made.drop_effects) == ((), False)
 
 
 @pytest.mark.parametrize(
@@ -105,29 +86,20 @@ def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(
     alternative: AlternativePattern, kind: str
 ) -> None:
     made = grounds(after=FLOOR, steps=[took(alternative), SearchStep(None, (), None)])
-    assert (made.verdict, made.kind, made.left, made.patterns) == (
-        "not_in_library",
-        kind,
-        1.0,
-        (alternative.what,),
-    )
+    assert (made.verdict, made.kind, made.left) == ("not_in_library", kind, 1.0)
+    assert made.patterns == (alternative.what,)
     assert alternative.what in made.summary
 
 
 def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
-    after = 0.8  # the foil has taken 0.3
-    small, large = (
-        grounds(
-            after=after, steps=[took(JUMP)], structure=ResidualStructure(0.0, fraction / after, 0.0, 0.0, 5.0)
-        )
-        for fraction in (0.29, 0.31)
-    )
+    after = 0.8  # the alternative pattern has taken 0.3
+    behind = (ResidualStructure(0.0, fraction / after, 0.0, 0.0, 5.0) for fraction in (0.29, 0.31))
+    small, large = (grounds(after=after, steps=[took(JUMP)], structure=structure) for structure in behind)
     assert (small.kind, large.kind) == ("drift", "memory")
 
 
 def test_borders_are_in_order() -> None:
-    """What the words must mean, whatever the exact numbers: half of the squares left is not partly
-    explained."""
+    """What the words must mean: half of the squares left is not partly explained."""
     assert 0.01 <= _EXPLAINED <= 0.12
     assert 0.2 <= _PARTLY <= 0.5
     assert _EXPLAINED < _FOREIGN <= _PARTLY
@@ -178,9 +150,8 @@ def test_held_out_error_counts() -> None:
 )
 def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict: str, dropped: bool) -> None:
     library = 0.7
-    made = grounds(
-        library=library, after=library - foreign, steps=[took(None), took(JUMP)], found=["backlash"]
-    )
+    steps = [took(None), took(JUMP)]
+    made = grounds(library=library, after=library - foreign, steps=steps, found=["backlash"])
     assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, (JUMP.what,))
     assert JUMP.what in made.summary
     assert ("backlash" in made.summary) != dropped
@@ -199,14 +170,9 @@ def test_several_effects_are_listed() -> None:
 
 
 def test_a_log_at_its_floor_divides_by_no_zero() -> None:
-    """The base model below the noise estimate: the error above it is none, and what seems left stays a
-    share."""
+    """The base model below the noise: the error above it is none, and what seems left stays a fraction."""
+    half = ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
     for base in (0.5 * FLOOR, FLOOR):
         assert grounds(base=base, library=base, after=base).verdict == "none"
-        assert (
-            grounds(
-                base=base, library=base, after=base, structure=ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
-            ).left
-            == 1.0
-        )
+        assert grounds(base=base, library=base, after=base, structure=half).left == 1.0
     assert grounds(base=0.0, library=0.0, after=0.0, floor=0.0).verdict == "none"

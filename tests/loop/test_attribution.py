@@ -4,8 +4,7 @@ names it, the seal is opened.
 Statistics over hundreds of logs are in perf/bench_attribution.py; here is one log of each kind.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +26,7 @@ from fastrod.identification.search import search
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
+from fastrod.types import Floats
 
 SEED = 1000
 
@@ -88,12 +88,8 @@ def test_sizes_are_those_in_the_seal() -> None:
 
 def test_of_nothing_comes_nothing() -> None:
     result = found("none")
-    assert (result.verdict, list(result.effects), result.remaining_kind, list(result.patterns)) == (
-        "none",
-        [],
-        "none",
-        [],
-    )
+    assert (result.verdict, result.remaining_kind) == ("none", "none")
+    assert [*result.effects, *result.patterns] == []
     assert result.test.after == result.test.before < 1.15 * result.noise.floor
     assert_array_equal(result.after, result.before)
     bounds = {bound.name: bound for bound in result.bounds}
@@ -120,8 +116,7 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
 
 
 def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
-    """Where nothing else predicts as well, that is what must be said. One effect of several: for others a
-    sibling fits to the noise."""
+    """One effect of several: for others a sibling fits to the noise."""
     result = found("stiffness_anisotropy", "stiffness_anisotropy")
     assert all(c.name != "stiffness_anisotropy" for c in result.tried)
     assert result.verdict in ("not_in_library", "partly_explained")
@@ -131,14 +126,12 @@ def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
 
 @pytest.mark.parametrize("effect", ["latency", "gravity"])
 def test_the_identified_robot_predicts_what_the_report_says(effect: str, tmp_path: Path) -> None:
-    """Written, read, and replayed by itself: the error on held-out rows is `after`, to the rod's step of
-    settling."""
+    """Written, read and replayed: the error on held-out rows is `after`, to the rod's step of settling."""
     result = found(effect)
     paths = {path.name: path for path in report.write(result, tmp_path)}
     again = load_robot(paths["identified.toml"])
-    assert [table["name"] for table in again.effects] == [
-        table["name"] for table in result.identified.effects
-    ]
+    names = [[table["name"] for table in each.effects] for each in (again, result.identified)]
+    assert names[0] == names[1]
     played = replay(sealed(effect)[0], again)
     rms = np.sqrt((played.residual[result.tested] ** 2).sum(1).mean())
     assert rms == pytest.approx(result.test.after, rel=0.01)
@@ -190,21 +183,15 @@ def test_no_fit_sees_what_is_held_out(change: str) -> None:
     last bit. Only the verdict may change, for it is the held-out error's."""
     log = backlash_log()
     rows = log.run == "two"
-    tip = log.tip_position.copy()
-    tip[rows] += (
-        1e-4 * np.random.default_rng(9).normal(size=(rows.sum(), 3))
-        if change == "noise"
-        else (0.0, 0.02, 0.01)
-    )
+    tip, noise = log.tip_position.copy(), 1e-4 * np.random.default_rng(9).normal(size=(rows.sum(), 3))
+    tip[rows] += noise if change == "noise" else (0.0, 0.02, 0.01)
     one, two = short(), identify(replace(log, tip_position=tip), robot(), held_out=["two"], threads=1)
     assert two.test.after > 1.02 * one.test.after
     same(one.noise, two.noise)
     same(one.before, two.before)
     same(one.path[0].train, two.path[0].train)
-    same(
-        [(c.name, c.held_out_rms, c.score, c.bic_gain) for c in one.tried],
-        [(c.name, c.held_out_rms, c.score, c.bic_gain) for c in two.tried],
-    )
+    tried = [[(c.name, c.held_out_rms, c.score, c.bic_gain) for c in each.tried] for each in (one, two)]
+    same(*tried)
     same(one.remaining, two.remaining)
     if change == "noise":
         same([(e.name, e.parameters) for e in one.effects], [(e.name, e.parameters) for e in two.effects])
@@ -220,64 +207,37 @@ def other(columns: list[int]) -> RunLog:
     return replace(log, dl=log.dl[:, columns])
 
 
-def two_markers() -> RunLog:
-    """Every other row is of a marker 20 mm beside the first."""
+def every_other(change: Callable[[Floats], Floats]) -> RunLog:
+    """Every other row has another tip: two markers, or two robots."""
     log = backlash_log()
-    return replace(
-        log, tip_position=log.tip_position + np.where(np.arange(len(log))[:, None] % 2, 0.0, [0.02, 0.0, 0.0])
-    )
+    rows = np.arange(len(log))[:, None] % 2 == 0
+    return replace(log, tip_position=np.where(rows, change(log.tip_position), log.tip_position))
 
 
-def two_robots() -> RunLog:
-    """Every other row is of a robot that is twice as long."""
+def all_rows(**fields: Any) -> RunLog:
+    """The log with the same number in every row of these fields."""
     log = backlash_log()
-    return replace(log, tip_position=log.tip_position * np.where(np.arange(len(log))[:, None] % 2, 1.0, 2.0))
+    return replace(log, **{name: np.full_like(getattr(log, name), value) for name, value in fields.items()})
 
 
+AFAR = "further from robot 'prototype' than from a robot that stands still"
+MIXED = "jumps by .* mm from sample to sample while the inputs rest.*two robots or two markers mixed"
+UNITS = (
+    "than from a robot that stands still: (the model cannot be solved|it moves .* times as predicted).*units"
+)
+SIGNS = r"it moves -0\.9\d* times as predicted.*signs \(negative = pulled\)"
 BAD = {
     "three rows": (lambda: backlash_log().rows(slice(0, 3)), "has 3 measured rows; identification needs 40"),
-    "constant input": (
-        lambda: replace(backlash_log(), dl=np.full((420, 4), 1e-3)),
-        "no input ever changes; nothing can be told",
-    ),
-    "no tip": (
-        lambda: replace(backlash_log(), tip_position=np.full((420, 3), np.nan)),
-        "there is nothing to explain",
-    ),
-    "no input": (
-        lambda: replace(backlash_log(), dl=np.full((420, 4), np.nan)),
-        "no row in which every input is there",
-    ),
-    "a tip that stands still": (
-        lambda: replace(backlash_log(), tip_position=np.full((420, 3), 0.05)),
-        "the measured tip never moves",
-    ),
-    "signs": (
-        lambda: replace(backlash_log(), dl=-backlash_log().dl),
-        r"it moves -0\.9\d* times as "
-        r"predicted.*signs \(negative = pulled\)",
-    ),
-    "columns turned on": (
-        lambda: other([1, 2, 3, 0]),
-        "further from robot 'prototype' than from a robot that stands still.*order of the dl_",
-    ),
-    "columns reversed": (
-        lambda: other([3, 2, 1, 0]),
-        "further from robot 'prototype' than from a robot that stands still",
-    ),
-    "millimetres": (
-        lambda: replace(backlash_log(), dl=1e3 * backlash_log().dl),
-        "than from a robot that stands still: (the model cannot be solved|it moves .* times as "
-        "predicted).*units",
-    ),
-    "two markers": (
-        two_markers,
-        "jumps by .* mm from sample to sample while the inputs rest.*two robots or two markers mixed",
-    ),
-    "two robots": (
-        two_robots,
-        "jumps by .* mm from sample to sample while the inputs rest.*two robots or two markers mixed",
-    ),
+    "constant input": (lambda: all_rows(dl=1e-3), "no input ever changes; nothing can be learnt"),
+    "no tip": (lambda: all_rows(tip_position=np.nan), "there is nothing to explain"),
+    "no input": (lambda: all_rows(dl=np.nan), "no row in which every input is there"),
+    "a tip that stands still": (lambda: all_rows(tip_position=0.05), "the measured tip never moves"),
+    "signs": (lambda: replace(backlash_log(), dl=-backlash_log().dl), SIGNS),
+    "columns turned on": (lambda: other([1, 2, 3, 0]), f"{AFAR}.*order of the dl_"),
+    "columns reversed": (lambda: other([3, 2, 1, 0]), AFAR),
+    "millimetres": (lambda: replace(backlash_log(), dl=1e3 * backlash_log().dl), UNITS),
+    "two markers": (lambda: every_other(lambda tip: np.add(tip, [0.02, 0.0, 0.0])), MIXED),
+    "two robots": (lambda: every_other(lambda tip: 2.0 * tip), MIXED),
 }
 
 
@@ -291,19 +251,15 @@ def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> 
 
 
 def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
-    """Half of the motion is as predicted, so it is not refused; but no effect of the library is made of
-    it."""
+    """Half of the motion is as predicted, so it is not refused; but no effect is made of it."""
     result = identify(other([1, 0, 2, 3]), robot(), threads=1)
     assert result.verdict == "not_in_library"
     assert list(result.effects) == []
 
 
 def test_too_much_held_out_is_refused() -> None:
-    with pytest.raises(
-        LogError,
-        match=r"leaves \d+ rows to fit once two, three, one@2: are held out; it "
-        r"needs 40",
-    ):
+    sentence = r"leaves \d+ rows to fit once two, three, one@2: are held out; it needs 40"
+    with pytest.raises(LogError, match=sentence):
         identify(backlash_log(), robot(), held_out=["two", "three", "one@2:"], threads=1)
 
 
@@ -311,9 +267,7 @@ def test_a_search_that_would_not_end_stops_and_says_so(monkeypatch: pytest.Monke
     monkeypatch.setattr(search, "MOST_PASSES", 1.0)
     result = identify(backlash_log(), robot(), threads=1)
     assert list(result.effects) == []
-    assert {c.why for c in result.tried if c.kind == "effect"} == {
-        "not tried: the model hardly converges on this log"
-    }
-    assert any(
-        note.startswith("the search stopped early: the model hardly converges") for note in result.notes
-    )
+    why = {c.why for c in result.tried if c.kind == "effect"}
+    assert why == {"not tried: the model hardly converges on this log"}
+    stopped = "the search stopped early: the model hardly converges"
+    assert any(note.startswith(stopped) for note in result.notes)

@@ -1,21 +1,25 @@
 """The slow twins against the truth files, against each other and against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rods import rod
 from truthfiles import numbers, rows
 
 from fastrod.errors import InputError
-from fastrod.model.robot import Mode, Robot, Segment, Tendon
+from fastrod.model.robot import Mode, Robot, Segment
 from fastrod.model.robotfile import load_robot
 from fastrod.reference import constant_curvature, shoot, solve_bvp
 
 EI, LENGTH = 0.0022, 0.07
+LOADS: dict[str, Any] = {
+    "tip_force": (0.1, 0.2, -0.1),
+    "point_force": [(0.03, (0.3, 0.0, 0.0))],
+    "follower_tip_force": (0.1, 0.0, 0.2),
+}
 
 # The truth files hold 1e-12 m; the integrator's rtol of 1e-9 over a rod of 0.1 to 0.4 m leaves 1e-11 m of
 # each.
@@ -28,24 +32,15 @@ def rotation(row: dict[str, str], letter: str) -> np.ndarray:
 
 def one_segment(row: dict[str, str]) -> tuple[Robot, dict[str, Any]]:
     """Robot and inputs of a row of tendon_length_truth.csv."""
-    n = int(row["n"])
-    tendons = tuple(
-        Tendon(offset=float(row["offset"]), angle=2.0 * np.pi * i / n, compliance=float(row["c"]))
-        for i in range(n)
-    )
-    stiffness = float(row["EI"])
-    segment = Segment(
-        length=float(row["l"]),
-        bending_stiffness=(stiffness, stiffness),
-        torsional_stiffness=float(row["GJ"]),
-        tendons=tendons,
-    )
+    n, length, stiffness = int(row["n"]), float(row["l"]), (float(row["EI"]),) * 2
+    tendons = {"n_tendons": n, "offset": float(row["offset"]), "compliance": float(row["c"])}
+    material = {"bending_stiffness": stiffness, "torsional_stiffness": float(row["GJ"])}
     inputs = {
         "tendon_length": numbers(row, *[f"L{i + 1}" for i in range(n)]),
         "tip_force": numbers(row, "Fx", "Fy", "Fz"),
         "line_force": numbers(row, "fx", "fy", "fz"),
     }
-    return Robot(name="truth", segments=(segment,)), inputs
+    return rod(length=length, **tendons, **material), inputs
 
 
 def in_mode(robot: Robot, mode: Mode) -> Robot:
@@ -53,28 +48,18 @@ def in_mode(robot: Robot, mode: Mode) -> Robot:
 
 
 def with_tendons(robot: Robot, **change: Any) -> Robot:
-    return replace(
-        robot,
-        segments=tuple(
-            replace(segment, tendons=tuple(replace(t, **change) for t in segment.tendons))
-            for segment in robot.segments
-        ),
-    )
+    tendons = [tuple(replace(tendon, **change) for tendon in one.tendons) for one in robot.segments]
+    segments = [replace(one, tendons=own) for one, own in zip(robot.segments, tendons, strict=True)]
+    return replace(robot, segments=tuple(segments))
 
 
 def cantilever(**change: Any) -> Robot:
-    words: dict[str, Any] = {
-        "length": LENGTH,
-        "bending_stiffness": (EI, EI),
-        "torsional_stiffness": 0.001,
-        "mode": "passive",
-    }
-    return Robot(name="rod", segments=(Segment(**(words | change)),), gravity=(0.0, 0.0, -9.81))
+    return replace(rod("passive", **change), gravity=(0.0, 0.0, -9.81))
 
 
 def prototype(*pulled: float) -> tuple[Robot, np.ndarray]:
     robot = load_robot("prototype")
-    return robot, robot.rest_tendon_length + np.array(pulled)
+    return robot, robot.rest_tendon_length + np.array(pulled or (-0.004, -0.002, 0.004, 0.002))
 
 
 @pytest.mark.parametrize("case", [0, 1, 3, 11, 12, 16, 22, 28])
@@ -87,9 +72,8 @@ def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
     assert_allclose(shape.tip_rotation, rotation(row, "R"), rtol=0, atol=TIP / LENGTH)
     # curvature is a rotation over a length, tension a moment over an offset
     assert_allclose(shape.curvature[0], numbers(row, "u0x", "u0y", "u0z"), rtol=0, atol=1e-7)
-    assert_allclose(
-        shape.tension, numbers(row, *[f"T{i + 1}" for i in range(robot.n_tendons)]), rtol=0, atol=1e-7
-    )
+    tension = numbers(row, *[f"T{i + 1}" for i in range(robot.n_tendons)])
+    assert_allclose(shape.tension, tension, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("case", ["A01", "A07", "A09", "A15", "A23", "B25", "B29", "B33", "B35"])
@@ -97,16 +81,11 @@ def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
 def test_shoot_is_the_truth_on_a_chain(case: str, mode: Mode) -> None:
     row = next(row for row in rows("tdcr_cases.csv") if row["case"] == case)
     robot = in_mode(load_robot(f"tdcr_{row['robot'].lower()}"), mode)
-    tension, length = (
-        numbers(row, *[f"q{i}" for i in range(1, 7)]),
-        numbers(row, *[f"kir_len{i}" for i in range(1, 7)]),
-    )
+    tension, length = (numbers(row, *[f"{name}{i}" for i in range(1, 7)]) for name in ("q", "kir_len"))
     compliance = np.array([tendon.compliance for tendon in robot.tendons])
     loads = {"tip_force": numbers(row, "fx", "fy", "fz"), "tip_moment": numbers(row, "mx", "my", "mz")}
-    given = (
-        {"tension": tension} if mode == "tendon_tension" else {"tendon_length": length - compliance * tension}
-    )
-    shape = shoot(robot, **given, **loads)
+    pulled, set_to = {"tension": tension}, {"tendon_length": length - compliance * tension}
+    shape = shoot(robot, **(pulled if mode == "tendon_tension" else set_to), **loads)
     assert shape.success, shape.message
     assert_allclose(shape.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=TIP)
     assert_allclose(shape.tip_rotation, rotation(row, "kir_r"), rtol=0, atol=1e-8)
@@ -148,34 +127,22 @@ def test_elastica(load: float, deflection: float, method: Any) -> None:
 
 
 def test_methods_and_integrators_agree() -> None:
-    robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
-    loads: dict[str, Any] = {
-        "tip_force": (0.1, 0.2, -0.1),
-        "point_force": [(0.03, (0.3, 0.0, 0.0))],
-        "follower_tip_force": (0.1, 0.0, 0.2),
-    }
-    best = shoot(robot, length, **loads)
-    for method in ("slsqp", "trust-constr"):
-        other = shoot(robot, length, **loads, method=method)
-        assert other.success, other.message
-        # each stops below the tolerance of 1e-9 m at the boundary
-        assert_allclose(other.position, best.position, rtol=0, atol=3e-9)
-    for integrator in ("RK45", "LSODA"):
-        other = shoot(robot, length, **loads, integrator=integrator)
-        assert other.success, other.message
-        # lower orders at the same rtol let more local errors add up
-        assert_allclose(other.position, best.position, rtol=0, atol=1e-8)
+    robot, length = prototype()
+    best = shoot(robot, length, **LOADS)
+    for name, others, tolerance in (
+        ("method", ("slsqp", "trust-constr"), 3e-9),  # each stops below 1e-9 m at the boundary
+        ("integrator", ("RK45", "LSODA"), 1e-8),  # lower orders at the same rtol: more local errors add up
+    ):
+        for value in others:
+            other = shoot(robot, length, **LOADS, **{name: value})
+            assert other.success, other.message
+            assert_allclose(other.position, best.position, rtol=0, atol=tolerance)
 
 
 def test_collocation_agrees_with_shooting() -> None:
-    robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
-    loads: dict[str, Any] = {
-        "tip_force": (0.1, 0.2, -0.1),
-        "tip_moment": (0.001, 0.0, 0.0005),
-        "line_force": [[(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 0.0, 0.0)]],
-        "point_force": [(0.03, (0.3, 0.0, 0.0))],
-        "follower_tip_force": (0.1, 0.0, 0.2),
-    }
+    robot, length = prototype()
+    line = [[(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 0.0, 0.0)]]
+    loads = LOADS | {"tip_moment": (0.001, 0.0, 0.0005), "line_force": line}
     one, two = shoot(robot, length, **loads), solve_bvp(robot, length, **loads)
     assert one.success
     assert two.success, two.message
@@ -188,31 +155,22 @@ def test_collocation_agrees_with_shooting() -> None:
 def test_collocation_agrees_with_shooting_on_a_chain() -> None:
     row = next(row for row in rows("tdcr_cases.csv") if row["case"] == "B33")
     robot = load_robot("tdcr_b")
-    length = numbers(row, *[f"kir_len{i}" for i in range(1, 7)]) - 1e-5 * numbers(
-        row, *[f"q{i}" for i in range(1, 7)]
-    )
-    shape = solve_bvp(robot, length, tip_force=numbers(row, "fx", "fy", "fz"))
+    path, tension = (numbers(row, *[f"{name}{i}" for i in range(1, 7)]) for name in ("kir_len", "q"))
+    shape = solve_bvp(robot, path - 1e-5 * tension, tip_force=numbers(row, "fx", "fy", "fz"))
     assert shape.success, shape.message
     assert_allclose(shape.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=1e-8)
-    passive = solve_bvp(cantilever(), tip_force=(0.7, 0.0, 0.0))
-    assert_allclose(
-        passive.position, shoot(cantilever(), tip_force=(0.7, 0.0, 0.0)).position, rtol=0, atol=1e-9
-    )
+    passive, shot = (solve(cantilever(), tip_force=(0.7, 0.0, 0.0)) for solve in (solve_bvp, shoot))
+    assert_allclose(passive.position, shot.position, rtol=0, atol=1e-9)
 
 
 def test_constant_curvature_is_an_arc() -> None:
-    """Lengths of an arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin
-    a)."""
+    """An arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin a)."""
     angle = 1.2
     robot, length = prototype(*(-angle * 0.0075 * np.cos(np.arange(4) * np.pi / 2.0)))
     shape = constant_curvature(robot, length)
     # angles in the robot file are rounded to 1e-12 rad
-    assert_allclose(
-        shape.tip_position,
-        LENGTH / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)]),
-        rtol=0,
-        atol=1e-12,
-    )
+    tip = LENGTH / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
+    assert_allclose(shape.tip_position, tip, rtol=0, atol=1e-12)
     assert_allclose(shape.tendon_length, length, rtol=0, atol=1e-13)
     assert shape.residual < 1e-12
     assert np.isnan(shape.tension).all()
@@ -225,20 +183,17 @@ def test_constant_curvature_is_an_arc() -> None:
 def test_constant_curvature_takes_off_what_distal_tendons_use() -> None:
     robot = load_robot("tdcr_b")
     first, second = np.array([4.0, -2.0]), np.array([-3.0, 5.0])
-    stretch = [
-        [np.array([y, -x]) for x, y in tendon.position(k + 1)]
-        for tendon, k in zip(robot.tendons, robot.tendon_segment, strict=True)
-    ]
-    length = robot.rest_tendon_length + 0.1 * np.array(
-        [sum(row @ u for row, u in zip(rows_, (first, second), strict=False)) for rows_ in stretch]
-    )
+    length = robot.rest_tendon_length.copy()
+    for t, (tendon, k) in enumerate(zip(robot.tendons, robot.tendon_segment, strict=True)):
+        for (x, y), u in zip(tendon.position(k + 1), (first, second), strict=False):
+            length[t] += 0.1 * (np.array([y, -x]) @ u)
     shape = constant_curvature(robot, length)
     assert_allclose(shape.curvature[5, :2], first, rtol=0, atol=1e-9)
     assert_allclose(shape.curvature[-1, :2], second, rtol=0, atol=1e-9)
 
 
 def test_the_base_pose_carries_the_whole_robot_along() -> None:
-    robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
+    robot, length = prototype()
     half = np.sqrt(0.5)
     rotated = replace(robot, base_position=(0.1, 0.2, 0.3), base_quaternion=(half, half, 0.0, 0.0))
     x_rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -251,12 +206,9 @@ def test_the_base_pose_carries_the_whole_robot_along() -> None:
 def test_self_weight_is_a_line_force() -> None:
     heavy, light = cantilever(line_density=0.05), cantilever()
     tilted = {"base_quaternion": (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)}
-    assert_allclose(
-        shoot(replace(heavy, **tilted)).position,
-        shoot(replace(light, **tilted), line_force=(0.0, 0.0, -0.05 * 9.81)).position,
-        rtol=0,
-        atol=1e-14,
-    )
+    weight = shoot(replace(heavy, **tilted))
+    force = shoot(replace(light, **tilted), line_force=(0.0, 0.0, -0.05 * 9.81))
+    assert_allclose(weight.position, force.position, rtol=0, atol=1e-14)
 
 
 def test_many_point_forces_are_a_line_force() -> None:
@@ -269,7 +221,7 @@ def test_many_point_forces_are_a_line_force() -> None:
 
 def test_a_follower_force_rotates_with_the_tip() -> None:
     follower = np.array([0.2, 0.1, -0.1])
-    robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
+    robot, length = prototype()
     shape = shoot(robot, length, follower_tip_force=follower)
     dead = shoot(robot, length, tip_force=shape.tip_rotation @ follower)
     assert_allclose(shape.position, dead.position, rtol=0, atol=1e-8)
@@ -278,9 +230,8 @@ def test_a_follower_force_rotates_with_the_tip() -> None:
 def test_extension_is_a_longer_segment() -> None:
     robot = cantilever(extension=(0.0, 0.02))
     shape = shoot(robot, extension=[0.01], tip_force=(0.3, 0.0, 0.0))
-    assert_allclose(
-        shape.position, shoot(cantilever(length=0.08), tip_force=(0.3, 0.0, 0.0)).position, rtol=0, atol=1e-14
-    )
+    longer = shoot(cantilever(length=0.08), tip_force=(0.3, 0.0, 0.0))
+    assert_allclose(shape.position, longer.position, rtol=0, atol=1e-14)
 
 
 def test_a_slack_tendon_pulls_no_more() -> None:
@@ -314,11 +265,14 @@ def test_a_mixed_chain_with_a_passive_end() -> None:
 
 
 def test_a_guess_saves_passes() -> None:
-    robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
+    robot, length = prototype()
     cold = shoot(robot, length, tip_force=(0.1, 0.2, -0.1))
     warm = shoot(robot, length, tip_force=(0.1, 0.2, -0.11), guess=cold)
     assert warm.success
     assert warm.evaluations < cold.evaluations
+
+
+LENGTHS = {"tendon_length": [0.07] * 4}
 
 
 @pytest.mark.parametrize(
@@ -328,15 +282,15 @@ def test_a_guess_saves_passes() -> None:
         ({"tendon_length": [0.07] * 3}, "tendon_length has shape"),
         ({"tendon_length": [70.0] * 4}, "In mm"),
         ({"tendon_length": [0.07, 0.07, 0.07, np.nan]}, "finite"),
-        ({"tendon_length": [0.07] * 4, "tip_force": [0.0, 1.0]}, "tip_force has shape"),
-        ({"tendon_length": [0.07] * 4, "line_force": np.zeros((2, 5, 3))}, "line_force has shape"),
-        ({"tendon_length": [0.07] * 4, "point_force": [(0.2, (0.0, 0.0, 1.0))]}, "backbone runs from"),
-        ({"tendon_length": [0.07] * 4, "point_force": [(0.02, (0.0, 1.0))]}, "point_force has shape"),
-        ({"tendon_length": [0.07] * 4, "extension": [0.01]}, "its range is"),
-        ({"tendon_length": [0.07] * 4, "extension": [0.0, 0.0]}, "extension has shape"),
-        ({"tendon_length": [0.07] * 4, "method": "slsp"}, "did you mean 'slsqp'"),
-        ({"tendon_length": [0.07] * 4, "integrator": "RK54"}, "did you mean 'RK45'"),
-        ({"tendon_length": [0.07] * 4, "tip_force": "up"}, "must be numbers"),
+        (LENGTHS | {"tip_force": [0.0, 1.0]}, "tip_force has shape"),
+        (LENGTHS | {"line_force": np.zeros((2, 5, 3))}, "line_force has shape"),
+        (LENGTHS | {"point_force": [(0.2, (0.0, 0.0, 1.0))]}, "backbone runs from"),
+        (LENGTHS | {"point_force": [(0.02, (0.0, 1.0))]}, "point_force has shape"),
+        (LENGTHS | {"extension": [0.01]}, "its range is"),
+        (LENGTHS | {"extension": [0.0, 0.0]}, "extension has shape"),
+        (LENGTHS | {"method": "slsp"}, "did you mean 'slsqp'"),
+        (LENGTHS | {"integrator": "RK54"}, "did you mean 'RK45'"),
+        (LENGTHS | {"tip_force": "up"}, "must be numbers"),
     ],
 )
 def test_wrong_inputs_are_reported(inputs: dict[str, Any], sentence: str) -> None:

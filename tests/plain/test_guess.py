@@ -264,7 +264,7 @@ def test_tendons_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
 
 
 def test_an_arc_from_its_lengths() -> None:
-    """Wires at distance d differ from the backbone by d times the bend; four more tendons of another length
+    """Tendons at distance d differ from the backbone by d times the bend; four more tendons of another length
     only pull."""
     robot = rod()
     layout, params, rest = compile_robots([robot], N_STEPS)

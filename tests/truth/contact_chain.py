@@ -1,5 +1,4 @@
-"""A row of exact arcs, its energy with tendons that stretch, and the first and second derivatives of both:
-numpy only."""
+"""A row of exact arcs, its energy with tendons that stretch, and two derivatives of both: numpy only."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ class Rod:
     precurvature: Floats  # (n, 3)
     crossing: Floats  # (n, m) 1 where the tendon runs through
     offset: Floats  # (n, m, 3)
-    free_length: Floats  # (m,) of the wire without tension
+    free_length: Floats  # (m,) of the tendon without tension
     compliance: Floats  # (m,)
     unilateral: bool
     node_force: Floats  # (n, 3) dead load at the end of each step
@@ -48,8 +47,7 @@ class Rod:
 
 
 class Chain(NamedTuple):
-    """Where the steps are in the world, and what follows from theta = h u of each, material frame (last
-    index)."""
+    """The steps in the world, and what follows from theta = h u of each, material frame (last index)."""
 
     start: Floats  # (n, 3, 3) frame at the start of each step
     node: Floats  # (n, 3) position at its end
@@ -72,15 +70,10 @@ def slope_of(rod: Rod, u: Floats, chain: Chain) -> Floats:
     h = rod.step[:, None]
     out = h * rod.stiffness * (u - rod.precurvature)
     # d|q|/du = d x t
-    out = out + h * np.einsum(
-        "i,ji,jix->jx", stretch / rod.compliance, rod.crossing, np.cross(rod.offset, direction)
-    )
+    arms = np.cross(rod.offset, direction)
+    out = out + h * np.einsum("i,ji,jix->jx", stretch / rod.compliance, rod.crossing, arms)
     beyond, lever = _carried(chain, rod.node_force)
-    turning = np.stack(
-        [lever[:, 1, 2] - lever[:, 2, 1], lever[:, 2, 0] - lever[:, 0, 2], lever[:, 0, 1] - lever[:, 1, 0]],
-        axis=1,
-    )
-    work = np.einsum("jxa,jx->ja", chain.spin, turning) + np.einsum("jxa,jx->ja", chain.shift, beyond)
+    work = np.einsum("jxa,jx->ja", chain.spin, _axial(lever)) + np.einsum("jxa,jx->ja", chain.shift, beyond)
     return rod.coarse(out - h * work)
 
 
@@ -88,13 +81,11 @@ def hessian_of(rod: Rod, u: Floats, chain: Chain, node_force: Floats) -> Floats:
     """(3 e, 3 e) second derivative of V with these forces on the nodes, dead."""
     n, h = len(u), rod.step
     beyond, lever = _carried(chain, node_force)
-    # what a distal step moves is carried round by the spin w of a proximal one: (w x dr) . G = w . (dr x G),
-    # summed
+    # a distal step's motion is carried round by a proximal spin w: (w x dr) . G = w . (dr x G), summed
     trace = np.trace(lever, axis1=1, axis2=2)[:, None, None]
     torque = np.cross(chain.shift, beyond[:, :, None], axis=1) + lever @ chain.spin - trace * chain.spin
-    pairs = -np.einsum(
-        "ixa,jxb->iajb", chain.spin * h[:, None, None], torque * h[:, None, None], optimize=True
-    )
+    sides = chain.spin * h[:, None, None], torque * h[:, None, None]
+    pairs = -np.einsum("ixa,jxb->iajb", *sides, optimize=True)
     later = np.arange(n)[:, None] < np.arange(n)
     pairs *= later[:, None, :, None]
     pairs = pairs + pairs.transpose(2, 3, 0, 1)
@@ -117,8 +108,7 @@ def hessian_of(rod: Rod, u: Floats, chain: Chain, node_force: Floats) -> Floats:
 
 
 def _own(rod: Rod, u: Floats, chain: Chain, beyond: Floats, lever: Floats) -> Floats:
-    """(n, 3, 3) second derivative of the work of all forces beyond a step by its own theta: an imaginary
-    step."""
+    """(n, 3, 3) second derivative of the work beyond a step by its own theta: an imaginary step."""
     theta = rod.step[:, None] * u
     there = np.swapaxes(chain.start, 1, 2)
     # sum of r G^T about the step's end, in its start frame and before its own turn
@@ -128,25 +118,20 @@ def _own(rod: Rod, u: Floats, chain: Chain, beyond: Floats, lever: Floats) -> Fl
     columns = []
     for b in range(3):
         side = theta + 1j * tiny * np.eye(3)[b]
-        turned = rotation_of(side) @ before
-        moment = np.stack(
-            [
-                turned[:, 1, 2] - turned[:, 2, 1],
-                turned[:, 2, 0] - turned[:, 0, 2],
-                turned[:, 0, 1] - turned[:, 1, 0],
-            ],
-            axis=1,
-        )
-        slope = np.einsum("jya,jy->ja", turning_of(side), moment) + np.einsum(
-            "jya,jy->ja", _bending(side), pull
-        )
+        moment = _axial(rotation_of(side) @ before)
+        slope = np.einsum("jya,jy->ja", turning_of(side), moment)
+        slope = slope + np.einsum("jya,jy->ja", _bending(side), pull)
         columns.append(slope.imag / tiny)
     return np.stack(columns, axis=-1)
 
 
+def _axial(a: NDArray[Any]) -> NDArray[Any]:
+    """(n, 3) of a - a^T, (n, 3, 3)."""
+    return np.stack([a[:, 1, 2] - a[:, 2, 1], a[:, 2, 0] - a[:, 0, 2], a[:, 0, 1] - a[:, 1, 0]], axis=1)
+
+
 def _carried(chain: Chain, node_force: Floats) -> tuple[Floats, Floats]:
-    """For the end of each step: force at and beyond it (n, 3), and sum of (r - r_end) G^T over those nodes
-    (n, 3, 3)."""
+    """At the end of each step: force at and beyond it (n, 3), sum of (r - r_end) G^T there (n, 3, 3)."""
 
     def to_tip(a: Floats) -> Floats:
         return np.flip(np.cumsum(np.flip(a, 0), axis=0), 0)
@@ -164,9 +149,8 @@ def chain_of(rod: Rod, u: Floats) -> Chain:
         start[j] = frame
         frame = frame @ turn[j]
     # the chord of an arc is the same series as the derivative of its turn
-    node = rod.base_position + np.cumsum(
-        rod.step[:, None] * np.einsum("jxy,jy->jx", start, turning[:, :, 2]), axis=0
-    )
+    chords = rod.step[:, None] * np.einsum("jxy,jy->jx", start, turning[:, :, 2])
+    node = rod.base_position + np.cumsum(chords, axis=0)
     return Chain(start, node, frame, start @ turning, rod.step[:, None, None] * (start @ _bending(theta)))
 
 
@@ -187,7 +171,7 @@ def path_of(rod: Rod, u: Floats) -> tuple[Floats, Floats]:
 
 
 def stretch_of(rod: Rod, u: Floats) -> tuple[Floats, Floats]:
-    """Stretch of the wires (m,) [m], zero where slack, and their directions (n, m, 3)."""
+    """Stretch of the tendons (m,) [m], zero where slack, and their directions (n, m, 3)."""
     path, direction = path_of(rod, u)
     stretch = path - rod.free_length
     return np.maximum(stretch, 0.0) if rod.unilateral else stretch, direction
@@ -200,8 +184,7 @@ def _hat(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(square: NDArray[Any], first: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """sum_k (-square)^k / (first + 2 k)! and its derivative by `square`, analytic at zero: angles of a step
-    are below one."""
+    """sum_k (-square)^k / (first + 2 k)! and its derivative by `square`, analytic at zero."""
     coefficient = 1.0 / float(np.prod(np.arange(1, first + 1)))
     total, slope, power = np.full_like(square, coefficient), np.zeros_like(square), np.ones_like(square)
     for k in range(1, 9):
@@ -223,8 +206,7 @@ def rotation_of(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def turning_of(w: NDArray[Any]) -> NDArray[Any]:
-    """Left Jacobian of SO(3), the integral of exp [s w]x over s in (0, 1): how exp [w]x turns, in the frame
-    it starts from."""
+    """Left Jacobian of SO(3), the integral of exp [s w]x over s in (0, 1), in the frame it starts from."""
     k, square = _hat(w), _square(w)
     return np.asarray(np.eye(3) + _series(square, 2)[0] * k + _series(square, 3)[0] * (k @ k))
 

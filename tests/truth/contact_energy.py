@@ -165,11 +165,10 @@ def minimise(
     - `planar` keeps the curvature about d2 alone, that is the rod in its own x z plane, ridge or not.
     """
     lengths = np.atleast_1d(np.asarray(length, dtype=float))
-    wires = np.atleast_1d(np.asarray(tendon_length, dtype=float))
-    n_segments, m = len(lengths), len(wires)
-    places = np.broadcast_to(
-        np.zeros((0, 2)) if offsets is None else np.asarray(offsets, dtype=float), (n_segments, m, 2)
-    )
+    tendons = np.atleast_1d(np.asarray(tendon_length, dtype=float))
+    n_segments, m = len(lengths), len(tendons)
+    given = np.zeros((0, 2)) if offsets is None else np.asarray(offsets, dtype=float)
+    places = np.broadcast_to(given, (n_segments, m, 2))
     compliances = np.broadcast_to(np.asarray(compliance, dtype=float), (m,))
     step = np.repeat(lengths / elements, elements)
     place = np.repeat(places, elements, axis=0)
@@ -182,18 +181,17 @@ def minimise(
     aside = np.zeros_like(node_force)
     aside[-1] = nudge
 
+    def along(a: ArrayLike) -> Floats:
+        return np.repeat(np.broadcast_to(np.asarray(a, dtype=float), (n_segments, 3)), elements, axis=0)
+
     def rod(share: float, rest: Floats) -> Rod:
         return Rod(
             step=step,
-            stiffness=np.repeat(
-                np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), elements, axis=0
-            ),
-            precurvature=np.repeat(
-                np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), elements, axis=0
-            ),
+            stiffness=along(K),
+            precurvature=along(precurvature),
             crossing=(~np.isnan(place[..., 0])).astype(float),
             offset=flat,
-            free_length=rest + share * (wires - compliances * np.asarray(pretension, dtype=float) - rest),
+            free_length=rest + share * (tendons - compliances * np.asarray(pretension, dtype=float) - rest),
             compliance=compliances,
             unilateral=unilateral,
             node_force=share * node_force if share == 1.0 else share * node_force + aside,
@@ -220,15 +218,11 @@ def patches(found: Minimum, least: float = 1e-6) -> list[Patch]:
     on = np.flatnonzero(size > least)
     runs = np.split(on, np.flatnonzero(np.diff(on) > 2) + 1) if len(on) else []
     s = found.arclength
-    return [
-        Patch(
-            float(np.average(s[run], weights=size[run])),
-            float(s[run[0]]),
-            float(s[run[-1]]),
-            found.contact_force[run].sum(axis=0),
-        )
-        for run in runs
-    ]
+    made = []
+    for run in runs:
+        mean = float(np.average(s[run], weights=size[run]))
+        made.append(Patch(mean, float(s[run[0]]), float(s[run[-1]]), found.contact_force[run].sum(axis=0)))
+    return made
 
 
 def _bottom(
@@ -261,15 +255,9 @@ def _bottom(
         if converged:
             break
         near = np.flatnonzero(look.gap < 2.0 * reach)
-        move = np.zeros_like(x)
-        move[free], wanted = _quadratic(
-            hessian[np.ix_(free, free)],
-            slope[free],
-            rows[np.ix_(near, free)],
-            look.gap[near],
-            now[near],
-            scale[free],
-        )
+        move, square = np.zeros_like(x), hessian[np.ix_(free, free)]
+        contacts = rows[np.ix_(near, free)], look.gap[near], now[near]
+        move[free], wanted = _quadratic(square, slope[free], *contacts, scale[free])
         farthest = float(np.linalg.norm(jacobian @ move, axis=1).max())
         part = min(1.0, reach / farthest) if farthest > 0.0 else 1.0
         x, part = _search(rod, obstacles, x, move, part, 2.0 * max(float(wanted.max(initial=0.0)), 1e-3))
@@ -283,8 +271,7 @@ def _bottom(
 
 
 def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
-    """The rod at curvatures x (3 e,), with a node at each minimum of an obstacle's distance within a step
-    that may touch."""
+    """The rod at curvatures x (3 e,), with a node at each minimum of distance that may touch."""
     u, n = rod.fine(x), len(rod.step)
     chain = chain_of(rod, u)
     begins = np.concatenate([rod.base_position[None], chain.node[:-1]])
@@ -311,18 +298,14 @@ def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
     fine = _cut(rod, at, np.array([s for _, s, _ in cuts]))
     if cuts:
         chain = chain_of(fine, fine.fine(x))
-    # node numbers in the cut rod: the ends of elements, each before it in the list moved on by the cuts up to
-    # it
+    # node numbers in the cut rod: the ends of elements, moved on by the cuts before them
     ends = np.arange(n) + np.searchsorted(at, np.arange(n), side="right")
     touch = at + np.arange(len(cuts))
     found = [o.distance(chain.node) for o in obstacles]
-    which = np.concatenate(
-        [np.repeat(np.arange(len(obstacles)), n), np.array([k for _, _, k in cuts], dtype=np.intp)]
-    )
-    node = np.concatenate([np.tile(ends, len(obstacles)), touch])
-    slot = np.concatenate(
-        [np.arange(len(obstacles) * n), (len(obstacles) + which[len(obstacles) * n :]) * n + at]
-    )
+    m = len(obstacles)
+    which = np.concatenate([np.repeat(np.arange(m), n), np.array([k for _, _, k in cuts], dtype=np.intp)])
+    node = np.concatenate([np.tile(ends, m), touch])
+    slot = np.concatenate([np.arange(m * n), (m + which[m * n :]) * n + at])
     return _Look(
         rod=fine,
         chain=chain,
@@ -358,16 +341,14 @@ def _cut(rod: Rod, at: NDArray[np.intp], where: Floats) -> Rod:
 
 
 def _sliding(look: _Look, u: Floats, c: int, there: Floats) -> Floats:
-    """(3 e, 3 e) what the touching point's own motion along the rod takes off the second derivative of its
-    gap."""
+    """(3 e, 3 e) what the contact's own motion along the rod takes off the gap's second derivative."""
     p, chain, rod = look.node[c], look.chain, look.rod
     frame = chain.start[p] @ rotation_of(rod.step[p] * u[p])
     tangent = frame[:, 2]
     spin = np.swapaxes(chain.spin * rod.step[:, None, None], 0, 1).copy()
     spin[:, p + 1 :] = 0.0
-    turned = rod.coarse(
-        np.swapaxes(np.cross(spin, tangent[:, None, None], axisa=0, axisb=0), 0, 2).swapaxes(1, 2)
-    )
+    across = np.cross(spin, tangent[:, None, None], axisa=0, axisb=0)
+    turned = rod.coarse(np.swapaxes(across, 0, 2).swapaxes(1, 2))
     mixed = there.T @ (look.curved[c] @ tangent) + turned.T @ look.normal[c]
     rate = tangent @ look.curved[c] @ tangent + look.normal[c] @ frame @ np.cross(u[p], E3)
     return np.outer(mixed, mixed) / max(float(rate), _FLAT)
@@ -406,14 +387,12 @@ def _quadratic(
 def _search(
     rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, move: Floats, part: float, price: float
 ) -> tuple[Floats, float]:
-    """Halve the move until energy plus `price` [N] times the depth of the nodes falls, or it is only
-    rounding."""
+    """Halve the move until energy plus `price` [N] times the depth falls, or it is only rounding."""
 
     def merit(x: Floats) -> float:
         look = _look(rod, obstacles, x)
-        return energy_of(look.rod, look.rod.fine(x), look.chain) + price * float(
-            np.maximum(-look.gap, 0.0).sum()
-        )
+        depth = float(np.maximum(-look.gap, 0.0).sum())
+        return energy_of(look.rod, look.rod.fine(x), look.chain) + price * depth
 
     here = merit(x)
     bending = float((rod.step[:, None] * rod.stiffness).max())
@@ -431,19 +410,15 @@ def _answer(
     contact = np.zeros((len(look.rod.step) + 1, 3))
     np.add.at(contact, look.node + 1, force[look.slot][:, None] * look.normal)
     positions = np.concatenate([rod.base_position[None], look.chain.node])
-    gap = (
-        np.min([o.distance(positions).value - rod.rho for o in obstacles], axis=0)
-        if obstacles
-        else np.full(len(positions), np.inf)
-    )
+    gaps = [o.distance(positions).value - rod.rho for o in obstacles]
+    gap = np.min(gaps, axis=0) if gaps else np.full(len(positions), np.inf)
     u = rod.fine(x)
     chain = chain_of(rod, u)
     stretch, direction = stretch_of(rod, u)
     tension = stretch / rod.compliance
     # moment of rod and wires in the middle of the first three elements, in the world, carried on to the base
-    moment = rod.stiffness * (u - rod.precurvature) + np.einsum(
-        "i,ji,jix->jx", tension, rod.crossing, np.cross(rod.offset, direction)
-    )
+    pull = np.einsum("i,ji,jix->jx", tension, rod.crossing, np.cross(rod.offset, direction))
+    moment = rod.stiffness * (u - rod.precurvature) + pull
     turned = np.einsum("jxy,jy->jx", chain.start @ rotation_of(0.5 * rod.step[:, None] * u), moment)
     return Minimum(
         arclength=np.concatenate([[0.0], np.cumsum(look.rod.step)]),

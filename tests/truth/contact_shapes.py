@@ -32,9 +32,8 @@ class HalfSpace:
     def distance(self, p: Floats) -> Distance:
         """Signed distance of points (p, 3)."""
         n = _unit(self.normal)
-        return Distance(
-            (p - np.asarray(self.point)) @ n, np.broadcast_to(n, p.shape), np.zeros((*p.shape, 3))
-        )
+        depth = (p - np.asarray(self.point)) @ n
+        return Distance(depth, np.broadcast_to(n, p.shape), np.zeros((*p.shape, 3)))
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A bar of `radius` [m] about the line through `point` along `axis`; `half_length` [m] caps it on both
-    sides of `point`."""
+    """A bar of `radius` [m] about the line through `point` along `axis`, of twice `half_length` [m]."""
 
     point: ArrayLike
     axis: ArrayLike
@@ -68,23 +66,20 @@ class Cylinder:
         round_ = (np.eye(3) - np.outer(a, a) - outer(n, n)) / d[:, None, None]
         side, end = d - self.radius, np.abs(along) - self.half_length
         cap = np.sign(along)[:, None] * a
-        corner, c = _length_and_direction(
-            np.maximum(side, 0.0)[:, None] * n + np.maximum(end, 0.0)[:, None] * cap
-        )
+        out, up = np.maximum(side, 0.0), np.maximum(end, 0.0)
+        corner, c = _length_and_direction(out[:, None] * n + up[:, None] * cap)
         on_side, on_end = (end <= 0.0) & (side >= end), (side <= 0.0) & (end > side)
         value = np.where(on_side, side, np.where(on_end, end, corner))
         normal = np.where(on_side[:, None], n, np.where(on_end[:, None], cap, c))
-        rim = (
-            outer(n, n) + np.outer(a, a) - outer(c, c) + np.maximum(side, 0.0)[:, None, None] * round_
-        ) / corner[:, None, None]
+        rim = outer(n, n) + np.outer(a, a) - outer(c, c) + out[:, None, None] * round_
+        rim = rim / corner[:, None, None]
         hessian = np.where(on_side[:, None, None], round_, np.where(on_end[:, None, None], 0.0, rim))
         return Distance(value, normal, hessian)
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box with half edges `half` (3,) [m] about `centre`; columns of `axes` are its directions in the
-    world."""
+    """A box with half edges `half` (3,) [m] about `centre`; its directions are the columns of `axes`."""
 
     centre: ArrayLike
     half: ArrayLike
@@ -108,8 +103,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Tube:
-    """All points further than `radius` [m] from the line through `point` along `axis` are solid: the rod is
-    inside."""
+    """All points further than `radius` [m] from the line through `point` along `axis`: the rod is inside."""
 
     point: ArrayLike
     axis: ArrayLike
@@ -138,8 +132,7 @@ def _unit(a: ArrayLike) -> Floats:
 
 
 def _length_and_direction(v: Floats) -> tuple[Floats, Floats]:
-    """Of (p, 3); on the point itself, where there is no direction, a zero vector, and a length that can
-    divide."""
+    """Of (p, 3); on the point itself a zero vector, and a length that can divide."""
     d = np.linalg.norm(v, axis=1)
     some = np.maximum(d, 1e-12)
     return some, v / some[:, None]

@@ -44,7 +44,7 @@ class _Rod:
     precurvature: NDArray[np.float64]  # (e, 3)
     crossing: NDArray[np.float64]  # (e, n) 1 where the tendon runs through
     offset: NDArray[np.float64]  # (e, n, 3)
-    free_length: NDArray[np.float64]  # (n,) of the wire without tension
+    free_length: NDArray[np.float64]  # (n,) of the tendon without tension
     compliance: NDArray[np.float64]  # (n,)
     unilateral: bool
     node_force: NDArray[np.float64]  # (e, 3) at the end of each element
@@ -77,8 +77,8 @@ def minimise(
     - `elements` a segment on the coarsest of `levels` grids, each twice as fine as the one before.
     """
     lengths = np.atleast_1d(np.asarray(length, dtype=float))
-    wires = np.atleast_1d(np.asarray(tendon_length, dtype=float))
-    n_segments, n = len(lengths), len(wires)
+    tendons = np.atleast_1d(np.asarray(tendon_length, dtype=float))
+    n_segments, n = len(lengths), len(tendons)
     places = np.broadcast_to(np.asarray(offsets, dtype=float), (n_segments, n, 2))
     compliances = np.broadcast_to(np.asarray(compliance, dtype=float), (n,))
     answers, u = [], None
@@ -91,17 +91,17 @@ def minimise(
         # half of an element's line force on each of its ends; the base's share does no work
         half = 0.5 * step[:, None] * np.asarray(line_force, dtype=float)
         node_force = half + np.concatenate([half[1:], np.asarray(tip_force, dtype=float)[None]])
+        bending, bent = (
+            np.repeat(np.broadcast_to(np.asarray(a, dtype=float), (n_segments, 3)), per_segment, axis=0)
+            for a in (K, precurvature)
+        )
         rod = _Rod(
             step=step,
-            stiffness=np.repeat(
-                np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), per_segment, axis=0
-            ),
-            precurvature=np.repeat(
-                np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), per_segment, axis=0
-            ),
+            stiffness=bending,
+            precurvature=bent,
             crossing=crossing.astype(float),
             offset=flat,
-            free_length=wires - compliances * np.asarray(pretension, dtype=float),
+            free_length=tendons - compliances * np.asarray(pretension, dtype=float),
             compliance=compliances,
             unilateral=unilateral,
             node_force=node_force,
@@ -120,10 +120,12 @@ def energy(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:
     stretch = _path(rod, u)[0] - rod.free_length
     if rod.unilateral:
         stretch = np.maximum(stretch, 0.0)
-    wires = np.einsum("bi,bi,i->b", stretch, stretch, 0.5 / rod.compliance)
+    tendons = np.einsum("bi,bi,i->b", stretch, stretch, 0.5 / rod.compliance)
     _, tangent, _ = _frames(rod, u)
     # the force beyond an element moves with every tangent before it: sum_k F_k . r_k = sum_j h t_j . N_j
-    return np.asarray(elastic + wires - np.einsum("j,bjx,jx->b", rod.step, tangent, _beyond(rod.node_force)))
+    return np.asarray(
+        elastic + tendons - np.einsum("j,bjx,jx->b", rod.step, tangent, _beyond(rod.node_force))
+    )
 
 
 def gradient(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:
@@ -135,9 +137,8 @@ def gradient(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:
     if rod.unilateral:
         tension = np.where(tension.real > 0.0, tension, 0.0)
     # d|q|/du = d x t
-    out = out + np.einsum(
-        "bi,j,ji,bjix->bjx", tension, rod.step, rod.crossing, np.cross(rod.offset[None], direction)
-    )
+    arms = np.cross(rod.offset[None], direction)
+    out = out + np.einsum("bi,j,ji,bjix->bjx", tension, rod.step, rod.crossing, arms)
     lever = np.cross(tangent, rod.step[:, None] * _beyond(rod.node_force))
     later = np.flip(np.cumsum(np.flip(lever, 1), axis=1), 1) - lever
     turned = np.einsum("bjyx,bjy->bjx", start, later)
@@ -162,10 +163,8 @@ def _bottom(rod: _Rod, u: NDArray[np.float64]) -> NDArray[np.float64]:
         # an element may turn by this much in one step: beyond it the energy is far from its parabola
         move *= min(1.0, reach / float(np.abs(rod.step[:, None] * move).sum()))
         here = energy(rod, u[None])[0]
-        while (
-            energy(rod, (u + move)[None])[0] > here + 1e-13 * (abs(here) + bending)
-            and np.abs(move).max() > 1e-14
-        ):
+        most = here + 1e-13 * (abs(here) + bending)
+        while energy(rod, (u + move)[None])[0] > most and np.abs(move).max() > 1e-14:
             move = 0.5 * move
         u = u + move
         if np.abs(move).max() < 1e-11 * (1.0 + np.abs(u).max()):
@@ -193,8 +192,7 @@ def _answer(rod: _Rod, u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _richardson(answers: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The elements' error runs in even powers of h, because every rule used is symmetric about the middle of
-    an element."""
+    """The elements' error runs in even powers of h: every rule is symmetric about an element's middle."""
     table = list(answers)
     for power in range(1, len(table)):
         table = [(4.0**power * fine - coarse) / (4.0**power - 1.0) for coarse, fine in pairwise(table)]
@@ -210,8 +208,7 @@ def _path(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _frames(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Frame at each element's start (batch, e, 3, 3), tangent at its middle (batch, e, 3), frame at the tip
-    (batch, 3, 3)."""
+    """Frame at each start (batch, e, 3, 3), tangent at each middle (batch, e, 3), frame at the tip."""
     h = rod.step[:, None]
     whole, half = _rotation(h * u), _rotation(0.5 * h * u)
     frame = np.broadcast_to(np.eye(3, dtype=u.dtype), (len(u), 3, 3))
@@ -235,8 +232,7 @@ def _hat(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(square: NDArray[Any], first: int) -> NDArray[Any]:
-    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not: element angles are below
-    one."""
+    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not; angles below one."""
     term = np.ones_like(square) / float(np.prod(np.arange(1, first + 1)))
     total = term
     for k in range(1, 14):

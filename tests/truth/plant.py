@@ -1,7 +1,7 @@
 """A plant: the real robot with an undeclared effect inside. numpy and scipy only, nothing shared with the
 package under test.
 
-It plays one or two push-pull segments and writes the log a camera would: wires -> transmission -> rod ->
+It plays one or two push-pull segments and writes the log a camera would: tendons -> transmission -> rod ->
 camera. Every effect is in another functional form than the obvious one (two creep times, sums of plays,
 half-cosine precurvature, ...), so a library that fits it has understood the effect and not recognised its own
 code. The rod is the principle of virtual work on Legendre curvatures, batched.
@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
+from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, tendons
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import bilinear, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation, Slerp
@@ -29,53 +29,24 @@ from scipy.special import expit
 
 Size = Literal["small", "typical", "large"] | float
 
-LIBRARY = (
-    *(
-        "gravity",
-        "payload",
-        "tip_force",
-        "friction",
-        "backlash",
-        "slack",
-        "tendon_stretch",
-        "coupling",
-        "drum_gain",
-        "encoder_offset",
-    ),
-    *(
-        "routing_angle",
-        "creep",
-        "precurvature",
-        "stiffness_taper",
-        "stiffness_anisotropy",
-        "stiffening",
-        "axial_compression",
-    ),
-    *(
-        "plastic_set",
-        "time_drift",
-        "temperature",
-        "latency",
-        "dynamics",
-        "frame_misalignment",
-        "marker_offset",
-        "camera_scale",
-        "lens",
-    ),
-)
+_LIBRARY = """
+gravity payload tip_force friction backlash slack tendon_stretch coupling drum_gain encoder_offset
+routing_angle creep precurvature stiffness_taper stiffness_anisotropy stiffening axial_compression
+plastic_set time_drift temperature latency dynamics frame_misalignment marker_offset camera_scale lens
+"""
+LIBRARY = tuple(_LIBRARY.split())
 OUTSIDE = ("bump", "sway", "ripple", "contact", "slip", "magnet")
 """What no library has: the verdict on these is "not in the library"."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the robot was told and what is known of its surroundings, a row per sample."""
+    """What the robot was commanded and what is known of its surroundings, a row per sample."""
 
     t: Array
     """(n,) [s], increasing."""
     dl: Array
-    """(n, n_tendons) commanded change of wire length [m]; wire i at 90 i deg, distal ones at 45 + 90 i
-    deg."""
+    """(n, n_tendons) commanded change of length [m]; tendon i at 90 i deg, distal ones at 45 + 90 i deg."""
     payload: Array
     """(n,) known mass at the tip [kg]."""
     base_quaternion: Array
@@ -124,8 +95,7 @@ def draw_pair(seed: int, *, segments: int = 1) -> Seal:
 
 
 def draw_many(seed: int, inputs: Inputs) -> Seal:
-    """One dominant effect, which comes first, and eight others that each move the tip by 0.1 to 0.2 of what
-    it does on these inputs."""
+    """One dominant effect, and eight others that each move the tip by 0.1 to 0.2 of what it does."""
     rng = np.random.default_rng([seed, 3])
     segments = inputs.segments
     names = [str(name) for name in rng.choice(library(segments), 9, replace=False)]
@@ -153,19 +123,17 @@ def _generator(seed: int, name: str) -> np.random.Generator:
 
 
 def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) -> dict[str, Any]:
-    """One effect's numbers; `amount` is what `size` scales. The longer robot has three times the reach: its
-    typical is lower."""
+    """One effect's numbers; `amount` is what `size` scales. The longer robot's typical is lower."""
     as_ever = name in ("stiffness_anisotropy", "time_drift", "lens", "bump", "sway")
     typical = (0.35, 0.85) if segments == 1 or as_ever else (0.05, 0.4)
-    span = {"small": (0.0, 0.35), "typical": typical, "large": (0.85, 1.0)}[
-        size if isinstance(size, str) else "typical"
-    ]
-    part, factor = rng.uniform(*span), 1.0 if isinstance(size, str) else size
+    spans = {"small": (0.0, 0.35), "large": (0.85, 1.0)}
+    span = spans.get(size, typical) if isinstance(size, str) else typical
+    fraction, factor = rng.uniform(*span), 1.0 if isinstance(size, str) else size
     n_pairs, reach = 2 * segments, 0.03 if segments == 1 else 0.09
 
     def amount(low: float, high: float, power: float = 1.0) -> float:
         """The higher the power, the nearer to the low end: where the high end would drown all else."""
-        return float(factor * (low + part**power * (high - low)))
+        return float(factor * (low + fraction**power * (high - low)))
 
     def signs(n: int = n_pairs) -> Array:
         return rng.choice([-1.0, 1.0], n)
@@ -198,10 +166,8 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
             return {"gain_loss": amount(0.03, 0.26, 1.5)}
         # share of the neighbour's bend: proximal into distal, distal into proximal; turned by an angle
         case "coupling" if segments > 1:
-            return {
-                "leak": amount(0.02, 0.20) * signs(1)[0] * np.array([1.0, uniform(0.0, 0.4)]),
-                "turn": uniform(-12.0, 12.0) * degree,
-            }
+            leak = amount(0.02, 0.20) * signs(1)[0] * np.array([1.0, uniform(0.0, 0.4)])
+            return {"leak": leak, "turn": uniform(-12.0, 12.0) * degree}
         case "drum_gain":
             return {"gain": amount(0.02, 0.05) * uniform(0.85, 1.0, n_pairs) * signs()}
         case "encoder_offset":  # rad of bend
@@ -210,10 +176,8 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
             return {"angle": amount(1.0, 5.0) * degree * uniform(0.6, 1.0, n_pairs) * signs()}
         case "creep":
             split = uniform(0.35, 0.65)
-            return {
-                "share": amount(0.03, 0.15) * np.array([split, 1.0 - split]),
-                "tau": np.array([log(1.0, 5.0), log(10.0, 60.0)]),
-            }
+            share = amount(0.03, 0.15) * np.array([split, 1.0 - split])
+            return {"share": share, "tau": np.array([log(1.0, 5.0), log(10.0, 60.0)])}
         case "precurvature":  # 1/m, half a cosine along each segment
             angle = uniform(0.0, 2.0 * np.pi, segments)
             return {"mode": amount(0.5, 3.0) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)}
@@ -234,60 +198,38 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
         case "latency":  # s, s per s
             return {"delay": amount(0.03, 0.2, 3.0), "skew": uniform(-1e-4, 1e-4)}
         case "dynamics":  # Hz of each pair, damping ratio; `amount` sets the period
-            return {
-                "frequency": 1.0 / amount(1.0 / 3.0, 1.0, 3.0) * uniform(0.9, 1.1, n_pairs),
-                "damping": uniform(0.15, 0.5),
-            }
+            frequency = 1.0 / amount(1.0 / 3.0, 1.0, 3.0) * uniform(0.9, 1.1, n_pairs)
+            return {"frequency": frequency, "damping": uniform(0.15, 0.5)}
         case "frame_misalignment":  # rotation vector [rad], m
-            return {
-                "turn": amount(0.5, 3.0) * degree * direction(),
-                "shift": amount(5e-4, 5e-3) * direction(),
-            }
+            turn = amount(0.5, 3.0) * degree * direction()
+            return {"turn": turn, "shift": amount(5e-4, 5e-3) * direction()}
         case "marker_offset":  # m in the tip's frame
             return {"offset": amount(2e-3, 2e-2, 3.0) * direction()}
         case "camera_scale":  # across and along the axis of view
             return {"scale": amount(0.005, 0.02) * signs(1)[0] * np.array([1.0, 1.0, uniform(0.7, 1.3)])}
         case "lens":  # relative at the edge of the workspace; m; m
-            return {
-                "edge": amount(0.002, 0.01) * signs(1)[0],
-                "radius": reach,
-                "centre": uniform(-0.2, 0.2, 2) * reach,
-            }
+            edge = amount(0.002, 0.01) * signs(1)[0]
+            return {"edge": edge, "radius": reach, "centre": uniform(-0.2, 0.2, 2) * reach}
         case "bump":  # m, share of the log
             return {"shift": amount(5e-4, 3e-3) * direction(), "at": uniform(0.25, 0.75)}
         case "sway":  # m, Hz, rad
-            return {
-                "sway": amount(3e-4, 2e-3) * direction(),
-                "frequency": log(0.2, 2.0),
-                "phase": uniform(0.0, 2.0 * np.pi),
-            }
+            sway = amount(3e-4, 2e-3) * direction()
+            return {"sway": sway, "frequency": log(0.2, 2.0), "phase": uniform(0.0, 2.0 * np.pi)}
         case "ripple":  # m of wire; m; turns of the motor per turn of the drum; rad
-            ripple = {
-                "amplitude": amount(1e-4, 3e-4),
-                "drum_radius": uniform(4e-3, 8e-3),
-                "gear": float(rng.integers(4, 9)),
-            }
-            return ripple | {"phase": uniform(0.0, 2.0 * np.pi, n_pairs)}
+            ripple = {"amplitude": amount(1e-4, 3e-4), "drum_radius": uniform(4e-3, 8e-3)}
+            return ripple | {"gear": float(rng.integers(4, 9)), "phase": uniform(0.0, 2.0 * np.pi, n_pairs)}
         case "contact":  # a plane: base frame, m, N/m
-            return {
-                "normal": direction(0.0),
-                "distance": uniform(0.35, 0.55) * reach,
-                "stiffness": amount(20.0, 100.0) / segments,
-            }
+            plane = {"normal": direction(0.0), "distance": uniform(0.35, 0.55) * reach}
+            return plane | {"stiffness": amount(20.0, 100.0) / segments}
         case "slip":  # m of wire, share of the log
             jump = amount(1e-4, 4e-4) * signs(1)[0] * (np.arange(n_pairs) == rng.integers(n_pairs))
             return {"jump": jump, "at": uniform(0.2, 0.7)}
         case "magnet":  # m in the base frame; N at `distance`; it falls with 1 / (d^2 + core^2)
             where, far = uniform(0.0, 2.0 * np.pi), uniform(1.6, 1.9) * reach
-            place = np.array(
-                [far * np.cos(where), far * np.sin(where), uniform(0.7, 1.0) * segments * LENGTH]
-            )
-            return {
-                "place": place,
-                "force": amount(0.06, 0.16) / segments,
-                "distance": reach,
-                "core": 0.35 * reach,
-            }
+            height = uniform(0.7, 1.0) * segments * LENGTH
+            place = np.array([far * np.cos(where), far * np.sin(where), height])
+            force = amount(0.06, 0.16) / segments
+            return {"place": place, "force": force, "distance": reach, "core": 0.35 * reach}
     names = ", ".join(library(segments) + OUTSIDE)
     raise ValueError(
         f"no effect of a robot of {segments} segment(s) is called {name!r}; the names are {names}"
@@ -323,12 +265,12 @@ def pose(inputs: Inputs, seal: Seal) -> tuple[Array, Array]:
 def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[Array, Array]:
     """Lengths that reach the rod (n, tendons) [m] and the bend they ask for (n, segments, 2) [rad].
 
-    Pairs p [m] (half the difference of two opposite wires) carry the effects; what the two wires share stays
-    as commanded.
+    Pairs p [m] (half the difference of two opposite wires) carry the effects; what the two tendons share
+    stays as commanded.
     """
     t, segments = inputs.t, inputs.segments
     p = pairs(inputs.dl)
-    common = inputs.dl - wires(p)
+    common = inputs.dl - tendons(p)
     share = (t - t[0]) / (t[-1] - t[0])
     to_pairs = routing(segments)
     to_bend = np.linalg.inv(to_pairs)
@@ -345,22 +287,18 @@ def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[A
     if e := effects.get("backlash"):  # three widths together round the corners
         p = np.mean([_play(p, e["half_width"] * k) for k in (0.85, 1.0, 1.15)], axis=0)
     if e := effects.get("friction"):
-        spring = sum(
-            w * (p - _play(p, OFFSET * r)) / (OFFSET * r)
-            for w, r in zip(e["shares"], e["radii"], strict=True)
-        )
-        along = np.linalg.norm((p @ to_bend.T).reshape(len(t), segments, 2), axis=2).sum(
-            axis=1, keepdims=True
-        )
+        plays = zip(e["shares"], OFFSET * e["radii"], strict=True)
+        spring = sum(w * (p - _play(p, r)) / r for w, r in plays)
+        bends = np.linalg.norm((p @ to_bend.T).reshape(len(t), segments, 2), axis=2)
+        along = bends.sum(axis=1, keepdims=True)
         p = p - OFFSET * e["loss"] * (1.0 + e["growth"] * along) * spring
     if e := effects.get("slack"):
         p = p - e["half_width"] * np.tanh(p / e["half_width"])
     if e := effects.get("creep"):
         p = p - sum(c * (p - _lag(t, p, tau)) for c, tau in zip(e["share"], e["tau"], strict=True))
     if e := effects.get("dynamics"):
-        p = np.stack(
-            [_ringing(t, x, f, e["damping"]) for x, f in zip(p.T, e["frequency"], strict=True)], axis=1
-        )
+        each = zip(p.T, e["frequency"], strict=True)
+        p = np.stack([_ringing(t, x, f, e["damping"]) for x, f in each], axis=1)
     bend = (p @ to_bend.T).reshape(len(t), segments, 2)
     if (e := effects.get("coupling")) and segments > 1:
         cos, sin = np.cos(e["turn"]), np.sin(e["turn"])
@@ -371,7 +309,7 @@ def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[A
     if e := effects.get("stiffening"):
         size = np.linalg.norm(bend, axis=2, keepdims=True)
         bend = bend * (1.0 - e["cubic"] * (e["saturation"] * np.tanh(size / e["saturation"])) ** 2)
-    return common + wires(bend.reshape(len(t), -1) @ to_pairs.T), bend
+    return common + tendons(bend.reshape(len(t), -1) @ to_pairs.T), bend
 
 
 def _play(x: Array, radius: float | Array) -> Array:
@@ -450,9 +388,8 @@ def _hidden_rod(segments: int, effects: dict[str, dict[str, Any]]) -> Rod:
         rho = e["gain_loss"] / (1.0 - e["gain_loss"])
         rod = replace(rod, compliance=2.0 * OFFSET**2 * rho * LENGTH / EI)
     if e := effects.get("routing_angle"):  # opposite wires turn together: otherwise they would lock
-        rod = replace(
-            rod, angle=angles(segments) + np.repeat(e["angle"].reshape(-1, 1, 2), 2, axis=1).reshape(-1)
-        )
+        turned = np.repeat(e["angle"].reshape(-1, 1, 2), 2, axis=1).reshape(-1)
+        rod = replace(rod, angle=angles(segments) + turned)
     if e := effects.get("gravity"):
         along = (np.arange(segments)[:, None] + NODES).reshape(-1) / segments
         rod = replace(rod, density=e["weight"] / GRAVITY * (1.0 + e["slope"] * (1.0 - 2.0 * along)))
@@ -490,16 +427,11 @@ def _loaded(
             gap = magnet["place"] - tip
             far = np.linalg.norm(gap, axis=1)[:, None, None]
             towards = gap[:, :, None] / far
-            pull = (
-                magnet["force"]
-                * (magnet["distance"] ** 2 + magnet["core"] ** 2)
-                / (far**2 + magnet["core"] ** 2)
-            )
+            core = magnet["core"] ** 2
+            pull = magnet["force"] * (magnet["distance"] ** 2 + core) / (far**2 + core)
             force = force + (pull * towards)[..., 0]
             along = towards * np.swapaxes(towards, 1, 2)
-            change = change + pull * (
-                2.0 * far / (far**2 + magnet["core"] ** 2) * along - (np.eye(3) - along) / far
-            )
+            change = change + pull * (2.0 * far / (far**2 + core) * along - (np.eye(3) - along) / far)
         if plane:  # one-sided, its edge rounded over 0.2 mm
             soft, normal = 2e-4, plane["normal"]
             depth = (tip @ normal - plane["distance"]) / soft
@@ -507,9 +439,8 @@ def _loaded(
             change = change - (plane["stiffness"] * expit(depth))[:, None, None] * np.outer(normal, normal)
         return force, change
 
-    chords, turn = rod.rest(
-        dl, push, down, payload=payload, lever=lever, field=field if magnet or plane else None
-    )
+    felt = field if magnet or plane else None
+    chords, turn = rod.rest(dl, push, down, payload=payload, lever=lever, field=felt)
     return np.sum(squeeze * chords, axis=1), turn
 
 
@@ -518,7 +449,7 @@ def _loaded(
 
 def arc_lengths(bend: Array) -> Array:
     """Commands (n, tendons) [m] of bends (n, segments, 2) [rad]."""
-    return wires(bend.reshape(len(bend), -1) @ routing(bend.shape[1]).T)
+    return tendons(bend.reshape(len(bend), -1) @ routing(bend.shape[1]).T)
 
 
 def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:
@@ -554,10 +485,8 @@ def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:
     again = t >= 130.0
     bend[again] = bend[: again.sum()]
     payload[again], side[again] = payload[: again.sum()], side[: again.sum()]
-    turned = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
-    return Inputs(
-        t, arc_lengths(bend), payload, np.where(side[:, None], turned, np.array([1.0, 0.0, 0.0, 0.0]))
-    )
+    upright, turned = np.eye(4)[0], np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+    return Inputs(t, arc_lengths(bend), payload, np.where(side[:, None], turned, upright))
 
 
 def operator_inputs(rng: np.random.Generator, segments: int = 1, seconds: float = 150.0) -> Inputs:
@@ -569,8 +498,7 @@ def operator_inputs(rng: np.random.Generator, segments: int = 1, seconds: float 
 
 
 def _wander(rng: np.random.Generator, x: Array, seconds: float, every: float, reach: float) -> Array:
-    """Random points of the disc every so many seconds, joined smoothly; zero at both ends and outside (n, 2)
-    [rad]."""
+    """Random points of the disc, joined smoothly; zero at both ends and outside (n, 2) [rad]."""
     n = max(int(seconds / every), 4)
     angle, size = rng.uniform(0.0, 2.0 * np.pi, n + 1), reach * np.sqrt(rng.uniform(0.0, 1.0, n + 1))
     size[[0, -1]] = 0.0

@@ -1,8 +1,8 @@
 """The rod of the plant: virtual work on Legendre curvatures, many samples at once. numpy only, nothing shared
 with the package under test.
 
-Equal segments with four wires each; wire i sits at OFFSET (cos a_i, sin a_i) in the material frame and runs
-from the base to the end of its segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the
+Equal segments with four tendons each; tendon i sits at OFFSET (cos a_i, sin a_i) in the material frame and
+runs from the base to the end of its segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the
 identity. Energy, per arclength s,
     integral (u - u*)' K (u - u*) / 2 ds  +  sum_i (l_i - L_i)^2 / (2 c)  -  work of dead loads,   l_i =
     integral |e3 + u x d_i| ds,
@@ -24,18 +24,17 @@ Field = Callable[[Array], tuple[Array, Array]]
 """Of tip positions (n, 3) [m]: force (n, 3) [N] and its change with the position (n, 3, 3) [N/m]."""
 
 LENGTH, EI, GJ, OFFSET, COMPLIANCE, GRAVITY = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5, 9.81
-"""Of each segment: m, N m^2, N m^2, m; of each wire m/N; m/s^2 along -z of the world."""
+"""Of each segment: m, N m^2, N m^2, m; of each tendon m/N; m/s^2 along -z of the world."""
 _NODES, _MODES = 8, 5
 
 
 def angles(segments: int) -> Array:
-    """Of the wires (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
+    """Of the tendons (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
     return np.concatenate([0.25 * np.pi * k + 0.5 * np.pi * np.arange(4) for k in range(segments)])
 
 
 def routing(segments: int) -> Array:
-    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before its
-    own too."""
+    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before."""
     angle = angles(segments).reshape(segments, 4)[:, :2].reshape(-1)
     row = OFFSET * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
     crosses = np.arange(segments)[None] <= (np.arange(2 * segments) // 2)[:, None]
@@ -43,13 +42,13 @@ def routing(segments: int) -> Array:
 
 
 def pairs(dl: Array) -> Array:
-    """Half the difference of opposite wires (n, 2 segments) [m]."""
-    wire = dl.reshape(len(dl), -1, 2, 2)
-    return 0.5 * (wire[:, :, 0] - wire[:, :, 1]).reshape(len(dl), -1)
+    """Half the difference of opposite tendons (n, 2 segments) [m]."""
+    tendon = dl.reshape(len(dl), -1, 2, 2)
+    return 0.5 * (tendon[:, :, 0] - tendon[:, :, 1]).reshape(len(dl), -1)
 
 
-def wires(pair: Array) -> Array:
-    """Both wires of each pair (n, tendons) [m] from the pairs (n, 2 segments)."""
+def tendons(pair: Array) -> Array:
+    """Both tendons of each pair (n, tendons) [m] from the pairs (n, 2 segments)."""
     first = pair.reshape(len(pair), -1, 1, 2)
     return np.concatenate([first, -first], axis=2).reshape(len(pair), -1)
 
@@ -63,12 +62,8 @@ def _lobatto() -> tuple[Array, Array, Array, Array]:
     beyond = np.stack([legendre.legval(1.0, p) - legendre.legval(x, p) for p in primitive], axis=1)
     gauss = 0.5 * (x[:-1] + x[1:]) + 0.5 * np.diff(x) * np.array([[-1.0], [1.0]]) / np.sqrt(3.0)
     inverse = np.linalg.inv(legendre.legvander(x, n - 1))
-    return (
-        0.5 * (x + 1.0),
-        0.5 * beyond @ inverse,
-        legendre.legvander(x, _MODES - 1),
-        legendre.legvander(gauss, _MODES - 1),
-    )
+    modes = (legendre.legvander(at, _MODES - 1) for at in (x, gauss))
+    return 0.5 * (x + 1.0), 0.5 * beyond @ inverse, *modes
 
 
 NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
@@ -77,8 +72,7 @@ NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
 
 @cache
 def _chain(segments: int) -> tuple[Array, Array]:
-    """Integral from each node to the tip (nodes, nodes) [m] and modes at the nodes (nodes, modes), of the
-    whole chain."""
+    """Integral from each node to the tip (nodes, nodes) [m], modes at the nodes (nodes, modes)."""
     later = np.triu(np.ones((segments, segments)), 1)
     beyond = np.kron(np.eye(segments), _BEYOND) + np.kron(later, np.tile(_BEYOND[0], (len(NODES), 1)))
     return LENGTH * beyond, np.kron(np.eye(segments), _MODE)
@@ -90,9 +84,9 @@ class Rod:
 
     segments: int = 1
     compliance: float = COMPLIANCE
-    """Of each wire [m/N]."""
+    """Of each tendon [m/N]."""
     angle: Array | None = None
-    """Of the wires (tendons,) [rad]; None: where they belong."""
+    """Of the tendons (tendons,) [rad]; None: where they belong."""
     stiffness: Array | None = None
     """(nodes, 3, 3) [N m^2]; None: uniform."""
     precurvature: Array | float = 0.0
@@ -121,24 +115,11 @@ class Rod:
         n = len(dl)
         modes = np.zeros((n, self.segments, _MODES, 3))
         modes[:, :, 0, :2] = (pairs(dl) @ np.linalg.inv(routing(self.segments)).T).reshape(n, -1, 2) / LENGTH
-        modes, tension, todo, weight = (
-            modes.reshape(n, -1, 3),
-            np.zeros_like(dl),
-            np.arange(n),
-            payload * down,
-        )
+        modes, tension, todo = modes.reshape(n, -1, 3), np.zeros_like(dl), np.arange(n)
+        weight = payload * down
         for k in range(120):
-            move, pull = self._newton(
-                modes[todo],
-                tension[todo],
-                dl[todo],
-                tip_force[todo],
-                down[todo],
-                weight[todo],
-                lever,
-                field,
-                k > 11,
-            )
+            given = (a[todo] for a in (modes, tension, dl, tip_force, down, weight))
+            move, pull = self._newton(*given, lever, field, k > 11)
             most = LENGTH * np.abs(move).sum(axis=(1, 2))
             # a radian in one pass is far enough, and less where it does not settle
             part = np.minimum(1.0, (1.0 if k < 12 else 0.3) / np.maximum(most, 1e-12))[:, None]
@@ -152,14 +133,11 @@ class Rod:
 
     def _shape(self, modes: Array) -> tuple[Array, Array]:
         """Chords (n, segments, 3) [m] and frames at the nodes (n, nodes, 3, 3)."""
-        gauss = np.einsum(
-            "gjm,nsmx->gnsjx", _MODE_GAUSS, modes.reshape(len(modes), self.segments, _MODES, 3), optimize=True
-        )
+        given = modes.reshape(len(modes), self.segments, _MODES, 3)
+        one, two = np.einsum("gjm,nsmx->gnsjx", _MODE_GAUSS, given, optimize=True)
         h = LENGTH * np.diff(NODES)[:, None]
         # fourth order Magnus
-        step = _exponential(
-            0.5 * h * (gauss[0] + gauss[1]) + (np.sqrt(3.0) / 12.0) * h**2 * _cross(gauss[0], gauss[1])
-        )
+        step = _exponential(0.5 * h * (one + two) + (np.sqrt(3.0) / 12.0) * h**2 * _cross(one, two))
         frame = np.empty((len(modes), self.segments, len(NODES), 3, 3))
         now = np.broadcast_to(np.eye(3), (len(modes), 3, 3))
         for s in range(self.segments):
@@ -184,8 +162,8 @@ class Rod:
     ) -> tuple[Array, Array]:
         """A step of the modes (n, segments * modes, 3) and the tensions (n, tendons) [N] after it.
 
-        Tensions are unknowns of their own: what a stiff wire would pull in a shape that is not yet the right
-        one is absurd.
+        Tensions are unknowns of their own: what a stiff tendon would pull in a shape that is not yet the
+        right one is absurd.
         """
         n, size = len(modes), 3 * modes.shape[1]
         beyond, mode = _chain(self.segments)
@@ -193,11 +171,10 @@ class Rod:
         weighted = step[:, None] * mode
         _, frame = self._shape(modes)
         u = mode @ modes
-        stiffness = (
-            np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1)) if self.stiffness is None else self.stiffness
-        )
+        uniform = np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1))
+        stiffness = uniform if self.stiffness is None else self.stiffness
         moment = np.einsum("jxy,njy->njx", stiffness, u - self.precurvature)
-        # wires
+        # tendons
         angle = angles(self.segments) if self.angle is None else self.angle
         place = OFFSET * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         last = np.repeat(np.arange(self.segments), 4)
@@ -205,33 +182,21 @@ class Rod:
         crosses = (np.repeat(np.arange(self.segments), len(NODES))[:, None] <= last).astype(float)
         q = _cross(u[:, :, None], place) + np.array([0.0, 0.0, 1.0])
         speed = np.sqrt(np.sum(q * q, axis=-1))
-        taut = (
-            np.einsum("j,nji,ji->ni", step, speed, crosses) - dl - LENGTH * (last + 1.0)
-        ) / self.compliance
+        path = np.einsum("j,nji,ji->ni", step, speed, crosses)
+        taut = (path - dl - LENGTH * (last + 1.0)) / self.compliance
         turn = _cross(place, q) * (crosses / speed)[..., None]  # d|q|/du
-        slope = (
-            (weighted.T @ turn.reshape(n, nodes, -1))
-            .reshape(n, len(mode.T), -1, 3)
-            .swapaxes(1, 2)
-            .reshape(n, -1, size)
-        )
+        slope = (weighted.T @ turn.reshape(n, nodes, -1)).reshape(n, len(mode.T), -1, 3)
+        slope = slope.swapaxes(1, 2).reshape(n, -1, size)
         moment = moment + np.einsum("ni,njix->njx", taut, turn)
         # d2|q|/du2 = ([d]x'[d]x - turn turn') / |q|
         pull = tension[:, None] * crosses / speed
         lock = np.sum(place**2, axis=1)[:, None, None] * np.eye(3) - place[:, :, None] * place[:, None]
-        curving = (
-            stiffness
-            + (pull @ lock.reshape(-1, 9)).reshape(n, nodes, 3, 3)
-            - np.swapaxes(pull[..., None] * turn, 2, 3) @ turn
-        )
+        curving = stiffness + (pull @ lock.reshape(-1, 9)).reshape(n, nodes, 3, 3)
+        curving = curving - np.swapaxes(pull[..., None] * turn, 2, 3) @ turn
         products = (weighted[:, :, None] * mode[:, None]).reshape(nodes, -1)
-        hessian = (np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products).reshape(
-            n, 3, 3, len(mode.T), -1
-        )
-        hessian = (
-            hessian.transpose(0, 3, 1, 4, 2).reshape(n, size, size)
-            + np.swapaxes(slope, 1, 2) @ slope / self.compliance
-        )
+        hessian = np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products
+        hessian = hessian.reshape(n, 3, 3, len(mode.T), -1).transpose(0, 3, 1, 4, 2).reshape(n, size, size)
+        hessian = hessian + np.swapaxes(slope, 1, 2) @ slope / self.compliance
         # loads: dt = dtheta x t turns all that is beyond; two turns, the nearer to the base outermost, give t
         # N' - (t.N) 1
         if field is not None:
@@ -242,25 +207,15 @@ class Rod:
             moved = _cross(np.swapaxes(frame, 2, 3), arm[:, :, None])
             moved = (weighted.T @ moved.reshape(n, nodes, 9)).reshape(n, size, 3)
             hessian = hessian - moved @ change @ np.swapaxes(moved, 1, 2)
-        force = (tip_force + weight)[:, None] + (beyond @ np.broadcast_to(self.density, nodes))[
-            :, None
-        ] * down[:, None]
+        mass = (beyond @ np.broadcast_to(self.density, nodes))[:, None]
+        force = (tip_force + weight)[:, None] + mass * down[:, None]
         spread = _outer(frame[..., 2], force)
-        work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3) + lever * _outer(
-            frame[:, -1, :, 2], weight
-        )[:, None]
-        lift = np.stack(
-            [
-                work[..., 1, 2] - work[..., 2, 1],
-                work[..., 2, 0] - work[..., 0, 2],
-                work[..., 0, 1] - work[..., 1, 0],
-            ],
-            axis=-1,
-        )
+        work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3)
+        work = work + lever * _outer(frame[:, -1, :, 2], weight)[:, None]
+        lift = np.stack([work[..., j, k] - work[..., k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1)
         moment = moment - (lift[:, :, None] @ frame)[:, :, 0]
         twice = (work - np.trace(work, axis1=2, axis2=3)[..., None, None] * np.eye(3)) @ frame
-        # what each mode has turned before a node: integral from the base of P_m R', then both orders of the
-        # two turns
+        # what each mode has turned before a node: integral of P_m R', then both orders of the two turns
         turned = (beyond[0] - beyond) @ (mode[:, :, None, None] * frame[:, :, None]).reshape(n, nodes, -1)
         turned = turned.reshape(n, nodes, -1, 3, 3).transpose(0, 2, 4, 1, 3).reshape(n, size, -1)
         half = turned @ (weighted[:, None, :, None] * twice[:, :, :, None]).reshape(n, 3 * nodes, size)

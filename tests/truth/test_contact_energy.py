@@ -49,7 +49,8 @@ def extrapolated(coarse: Any, fine: Any) -> Any:
     return (4.0 * np.asarray(fine) - np.asarray(coarse)) / 3.0
 
 
-# tip force [N] and tip z [m]; they belong to wires that do not stretch: 1e-7 m/N moves z by less than 1e-6 m
+# tip force [N] and tip z [m]; they belong to tendons that do not stretch: 1e-7 m/N moves z by less than 1e-6
+# m
 @pytest.mark.parametrize(
     ("kappa", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
 )
@@ -68,7 +69,7 @@ def test_tip_on_a_wall(kappa: float, force: float, z: float) -> None:
 
 def test_wires_that_stretch_press_less() -> None:
     stiff, soft = pressed(8.0, 1e-7, planar=True), pressed(8.0, 1e-5, planar=True)
-    # 0.575 and 0.567 N: the rod answers at the wall like a spring in series with its wires
+    # 0.575 and 0.567 N: the rod answers at the wall like a spring in series with its tendons
     assert soft.total_force[0] / stiff.total_force[0] == pytest.approx(0.985, abs=2e-3)
 
 
@@ -212,7 +213,7 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
     places = np.zeros((len(case["length"]), 0, 2)) if case["offsets"] is None else np.asarray(case["offsets"])
     crossed = (~np.isnan(places[..., 0])).sum(axis=0)
     for k, (length, K) in enumerate(zip(case["length"], case["K"], strict=True)):
-        wires = tuple(
+        routed = tuple(
             fastrod.Tendon(
                 offset=tuple(float(np.hypot(*p)) for p in places[: k + 1, i]),
                 angle=tuple(math.atan2(p[1], p[0]) for p in places[: k + 1, i]),
@@ -221,13 +222,13 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
             )
             for i in np.flatnonzero(crossed == k + 1)
         )
-        mode = "tendon_length" if wires else "passive"
+        mode = "tendon_length" if routed else "passive"
         segments.append(
             fastrod.Segment(
                 length=length,
                 bending_stiffness=(K[0], K[1]),
                 torsional_stiffness=K[2],
-                tendons=wires,
+                tendons=routed,
                 mode=mode,
             )
         )

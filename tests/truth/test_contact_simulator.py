@@ -36,14 +36,14 @@ def to_axis(axis: list[float]) -> tuple[float, float, float, float]:
 def robot_of(case: dict[str, Any]) -> Robot:
     n = len(case["length"])
     offsets = np.zeros((n, 0, 2)) if case["offsets"] is None else np.array(case["offsets"], dtype=float)
-    wires: list[list[Tendon]] = [[] for _ in range(n)]
+    routed: list[list[Tendon]] = [[] for _ in range(n)]
     for t in range(offsets.shape[1]):
         places = [p for p in offsets[:, t] if np.isfinite(p).all()]
         offset, angle = (
             [float(f) for f in v]
             for v in ((np.hypot(*p) for p in places), (np.arctan2(p[1], p[0]) for p in places))
         )
-        wires[len(places) - 1].append(
+        routed[len(places) - 1].append(
             Tendon(offset=tuple(offset), angle=tuple(angle), compliance=case["compliance"])
         )
     segments = tuple(
@@ -51,8 +51,8 @@ def robot_of(case: dict[str, Any]) -> Robot:
             length=case["length"][k],
             bending_stiffness=tuple(case["K"][k][:2]),
             torsional_stiffness=case["K"][k][2],
-            mode="tendon_length" if wires[k] else "passive",
-            tendons=tuple(wires[k]),
+            mode="tendon_length" if routed[k] else "passive",
+            tendons=tuple(routed[k]),
         )
         for k in range(n)
     )

@@ -8,6 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 from truthfiles import numbers, rows
 
+K = [0.0022, 0.0022, 0.001]
+
 
 def ring(n: int, offset: float) -> np.ndarray:
     angle = 2.0 * np.pi * np.arange(n) / n
@@ -49,20 +51,12 @@ def test_least_energy_of_a_chain_is_the_truth(case: str) -> None:
     # angles 90, -30, 210 deg
     place = np.array([[0.0, 1.0], [np.cos(np.pi / 6.0), -0.5], [-np.cos(np.pi / 6.0), -0.5]])
     away = np.full((3, 2), np.nan)
-    offsets = np.stack(
-        [np.concatenate([first * place, second * place]), np.concatenate([away, second * place])]
-    )
+    offsets = np.stack([np.concatenate([near, second * place]) for near in (first * place, away)])
     tension = numbers(row, *[f"q{i}" for i in range(1, 7)])
     path = numbers(row, *[f"kir_len{i}" for i in range(1, 7)])
     c = 1e-5
-    found = energy.minimise(
-        [length, length],
-        stiffness * np.array([1.0, 1.0, 2.0 / 2.6]),
-        offsets,
-        path - c * tension,
-        c,
-        numbers(row, "fx", "fy", "fz"),
-    )
+    K, force = stiffness * np.array([1.0, 1.0, 2.0 / 2.6]), numbers(row, "fx", "fy", "fz")
+    found = energy.minimise([length, length], K, offsets, path - c * tension, c, force)
     # the file's own answers are good to some 1e-11 m; the extrapolation's error estimate bounds ours
     assert found.error < 1e-8
     assert_allclose(found.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=1e-8)
@@ -71,29 +65,19 @@ def test_least_energy_of_a_chain_is_the_truth(case: str) -> None:
 
 
 def test_error_falls_with_the_square_of_the_element() -> None:
-    def tip(elements: int) -> np.ndarray:
-        return energy.minimise(
-            0.07,
-            [0.0022, 0.0022, 0.001],
-            ring(4, 0.0075),
-            [0.066, 0.069, 0.074, 0.071],
-            1e-5,
-            [0.2, 0.1, -0.1],
-            elements=elements,
-            levels=2,
-        ).tip_position
+    def tip(**options: int) -> np.ndarray:
+        lengths, force = [0.066, 0.069, 0.074, 0.071], [0.2, 0.1, -0.1]
+        return energy.minimise(0.07, K, ring(4, 0.0075), lengths, 1e-5, force, **options).tip_position
 
-    exact = energy.minimise(
-        0.07, [0.0022, 0.0022, 0.001], ring(4, 0.0075), [0.066, 0.069, 0.074, 0.071], 1e-5, [0.2, 0.1, -0.1]
-    ).tip_position
-    n = np.array([4, 8, 16])
-    slope = np.polyfit(np.log(n), np.log([np.abs(tip(k) - exact).max() for k in n]), 1)[0]
+    exact, n = tip(), np.array([4, 8, 16])
+    error = [np.abs(tip(elements=k, levels=2) - exact).max() for k in n]
+    slope = np.polyfit(np.log(n), np.log(error), 1)[0]
     # one extrapolation leaves the fourth power; that it does is what the others rest on
     assert slope == pytest.approx(-4.0, abs=0.3)
 
 
 def test_a_slack_wire_does_nothing() -> None:
-    K, lengths, force = [0.0022, 0.0022, 0.001], np.array([0.066, 0.080, 0.080]), [0.0, 0.1, 0.0]
+    lengths, force = np.array([0.066, 0.080, 0.080]), [0.0, 0.1, 0.0]
     found = energy.minimise(0.07, K, ring(3, 0.0075), lengths, 1e-5, force, unilateral=True)
     alone = energy.minimise(0.07, K, ring(3, 0.0075)[:1], lengths[:1], 1e-5, force)
     assert found.tension[0] > 0.0

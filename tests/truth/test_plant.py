@@ -25,30 +25,16 @@ def least_energy(
     for k in range(1, segments):
         offsets[k, : 4 * k] = np.nan
     lengths = plant.arc_lengths(bend[None])[0] + LENGTH * np.repeat(np.arange(1, segments + 1), 4)
-    K = np.tile([EI, EI, GJ], (segments, 1))
-    found = energy.minimise(
-        np.full(segments, LENGTH),
-        K,
-        offsets,
-        lengths,
-        compliance,
-        payload * down,
-        line / GRAVITY * down,
-        elements=6,
-        levels=3,
-    )
+    rod = np.full(segments, LENGTH), np.tile([EI, EI, GJ], (segments, 1)), offsets, lengths, compliance
+    found = energy.minimise(*rod, payload * down, line / GRAVITY * down, elements=6, levels=3)
     assert found.error < 5e-6
     return found.tip_position
 
 
 def still(bend: np.ndarray, payload: float) -> plant.Inputs:
     """Two samples of one pose, the base turned by 90 degrees."""
-    return plant.Inputs(
-        np.array([0.0, 1.0]),
-        plant.arc_lengths(np.stack([bend, bend])),
-        np.full(2, payload),
-        np.tile(SIDEWAYS, (2, 1)),
-    )
+    t, dl = np.array([0.0, 1.0]), plant.arc_lengths(np.stack([bend, bend]))
+    return plant.Inputs(t, dl, np.full(2, payload), np.tile(SIDEWAYS, (2, 1)))
 
 
 @pytest.mark.parametrize(
@@ -73,7 +59,7 @@ def test_weight_and_stretch_are_those_of_least_energy() -> None:
 def test_stretch_loses_the_share_of_the_bend_that_it_claims() -> None:
     bend = np.array([[0.4, 0.0]])
     _, turn = plant.pose(still(bend, 0.0), plant.Seal({"tendon_stretch": {"gain_loss": 0.2}}, 0))
-    # small bends: the wires' own path, which the share leaves out, is of second order
+    # small bends: the tendons' own path, which the share leaves out, is of second order
     assert_allclose(np.arccos(turn[0, 2, 2]), 0.8 * 0.4, rtol=1e-2)
 
 
@@ -98,11 +84,8 @@ def test_every_effect_moves_the_tip_by_its_size(name: str, designed: plant.Input
 
 def test_coupling_needs_two_segments() -> None:
     inputs = plant.operator_inputs(np.random.default_rng(0), segments=2, seconds=8.0)
-    moved = (
-        plant.pose(inputs, plant.draw(0, "coupling", segments=2))[0]
-        - plant.pose(inputs, plant.draw(0, "none"))[0]
-    )
-    assert np.abs(moved).max() > 1e-3
+    coupled, bare = (plant.pose(inputs, plant.draw(0, name, segments=2))[0] for name in ("coupling", "none"))
+    assert np.abs(coupled - bare).max() > 1e-3
     assert "coupling" not in plant.library(1)
 
 
@@ -150,22 +133,18 @@ def test_draws_repeat_and_stay_in_their_kind() -> None:
 
 def test_a_dominant_effect_dominates() -> None:
     inputs = plant.designed_inputs(np.random.default_rng(0))
-    many = plant.draw_many(1, inputs)
-    assert len(many.effects) == 9
-    assert set(many.effects) <= set(plant.LIBRARY)
-    bare = plant.pose(inputs, plant.Seal({}, 1))[0]
-    moved = [
-        np.sqrt(np.mean((plant.pose(inputs, plant.Seal({n: e}, 1))[0] - bare) ** 2))
-        for n, e in many.effects.items()
-    ]
+    effects = plant.draw_many(1, inputs).effects
+    assert len(effects) == 9
+    assert set(effects) <= set(plant.LIBRARY)
+    alone = ({name: effect} for name, effect in effects.items())
+    bare, *tips = (plant.pose(inputs, plant.Seal(one, 1))[0] for one in ({}, *alone))
+    moved = [np.sqrt(np.mean((tip - bare) ** 2)) for tip in tips]
     # 0.1 to 0.2 of the dominant one, were every effect in proportion to its size
     assert max(moved[1:]) < 0.4 * moved[0]
 
 
 def test_draws_are_independent_of_what_else_is_drawn() -> None:
-    assert (
-        plant.draw(4, "gravity").effects["gravity"]
-        == plant.draw(4, ["payload", "gravity"]).effects["gravity"]
-    )
+    alone, both = (plant.draw(4, names).effects for names in ("gravity", ["payload", "gravity"]))
+    assert alone["gravity"] == both["gravity"]
     with pytest.raises(ValueError, match="no effect of a robot of 1 segment"):
         plant.draw(0, "coupling")

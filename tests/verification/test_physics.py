@@ -246,7 +246,7 @@ def one_sided(robot: Robot) -> Robot:
 
 @pytest.mark.parametrize("pull", [0.0, 3e-4, -1e-3])
 def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
-    """Wires that can only pull: pulled together, let go together, and at the edge where some hang loose."""
+    """Tendons that can only pull: pulled together, let go together, and at the edge where some hang loose."""
     rng = np.random.default_rng(4)
     for robot in (one_sided(rod()), one_sided(load_robot("tdcr_a"))):
         angles = rng.uniform(-0.6, 0.6, (40, 2 * robot.n_segments))

@@ -1,7 +1,10 @@
 """The quadruped's scenes can fail, and hold at other time steps."""
 
+import sys
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes.a1 import look, push
@@ -18,26 +21,29 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
     assert figures["balance of the cube's momentum, N s"] < 1e-12
 
 
-def test_push_that_misses_is_reported(monkeypatch):
-    monkeypatch.setattr(push, "PLACE", (0.36, 0.3, push.SIZE / 2))
-    with pytest.raises(
-        SceneError,
-        match=r"^scene neck_push: the cube moved .* m; the neck is to push it "
-        r"farther than it is wide\.$",
-    ):
-        push.NeckPush().check()
-
-
-def test_look_that_sees_nothing_is_reported(monkeypatch):
-    monkeypatch.setattr(look, "CORNERS", ((1, 1), (1, -1), (-1, 1), (-30, -1)))
-    with pytest.raises(SceneError, match=r"^scene neck_look: 3 of 4 corners were seen"):
-        look.NeckLook().check()
-
-
-def test_neck_in_contact_with_the_wall_is_reported(monkeypatch):
-    monkeypatch.setattr(look, "MIDDLE", (0.77, 0.0))
-    with pytest.raises(SceneError, match=r"^scene neck_look: .*the neck "):
-        look.NeckLook().check()
+@pytest.mark.parametrize(
+    ("scene", "setting", "value", "sentence"),
+    [
+        (
+            push.NeckPush,
+            "PLACE",
+            (0.36, 0.3, push.SIZE / 2),
+            r"neck_push: the cube moved .* m; the neck is to push it farther than it is wide\.$",
+        ),
+        (
+            look.NeckLook,
+            "CORNERS",
+            ((1, 1), (1, -1), (-1, 1), (-30, -1)),
+            "neck_look: 3 of 4 corners were seen",
+        ),
+        (look.NeckLook, "MIDDLE", (0.77, 0.0), r"neck_look: .*the neck "),
+    ],
+    ids=["a push that misses", "a look that sees nothing", "a neck that touches the wall"],
+)
+def test_what_fails_is_reported(scene, setting, value, sentence, monkeypatch):
+    monkeypatch.setattr(sys.modules[scene.__module__], setting, value)
+    with pytest.raises(SceneError, match=f"^scene {sentence}"):
+        scene().check()
 
 
 def test_neck_stands_on_the_head_with_its_axes_as_stated():
@@ -45,8 +51,8 @@ def test_neck_stands_on_the_head_with_its_axes_as_stated():
     pose, trunk = mount.motion().pose, world.getBasePositionAndOrientation(mount.body)
     axes = np.array(world.getMatrixFromQuaternion(np.roll(pose[3:], -1).tolist())).reshape(3, 3)
     # the trunk stands level to that
-    np.testing.assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)
-    np.testing.assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
+    assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)
+    assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
     assert np.abs(pose[:2] - np.array(trunk[0])[:2] - MOUNT[:2]).max() < 0.02
     assert max(abs(v) for v in world.getBaseVelocity(mount.body)[0]) < 0.01
     world.disconnect()
@@ -57,11 +63,9 @@ def test_gait_of_the_neck_is_a_sine():
     stage = push.NeckPush().stage()
     bends = SegmentActions(robot).matrix[: robot.n_tendons, 1::3]
     for t in (0.0, 0.3, 1.1):
-        pulled = (
-            stage.gait(t)["tendon_length"]
-            - robot.rest_tendon_length
-            - np.cumsum(stage.gait(t)["extension"])[robot.tendon_segment]
-        )
+        gait = stage.gait(t)
+        longer = np.cumsum(gait["extension"])[robot.tendon_segment]
+        pulled = gait["tendon_length"] - robot.rest_tendon_length - longer
         each = np.linalg.lstsq(bends, pulled, rcond=None)[0] / stage.actions.offset
-        np.testing.assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
+        assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
     stage.close()

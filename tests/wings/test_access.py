@@ -1,22 +1,20 @@
 """Access to a page, its websocket and its controls: strangers, nonsense, too many, and two at once."""
 
-from __future__ import annotations
-
 import re
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import msgspec.msgpack
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
 
-from pages import HANDSHAKE, RawPage, request, slider, until, websocket
+from pages import CAMERA, DRIVE, HANDSHAKE, RawPage, request, slider, until, websocket
 
 from fastrod.access import MOST_PAGES, Access, serve_guarded
 from fastrod.errors import InputError
@@ -33,19 +31,7 @@ def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """Of each kind of page there is."""
     folder = tmp_path_factory.mktemp("access")
     if request.param == "drive":
-        words = [
-            "fastrod.commands.cli",
-            "drive",
-            "--emulate",
-            "--seed",
-            "3",
-            "--no-home",
-            "--no-open",
-            "--port",
-            "0",
-        ]
-        command, pipe = [sys.executable, "-m", *words], subprocess.PIPE
-        with subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
+        with Popen(DRIVE, cwd=folder, stdout=PIPE, stderr=PIPE, text=True) as process:
             assert process.stdout is not None
             line = process.stdout.readline()
             found = re.search(r"http://\S+", line)
@@ -143,8 +129,8 @@ def test_whoever_has_the_address_is_let_in(address: str, name: str, origin: str,
 
 
 def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> None:
-    with websocket(address) as socket:
-        assert len(socket.recv(timeout=60.0)) > 16
+    with websocket(address) as opened:
+        assert len(opened.recv(timeout=60.0)) > 16
 
 
 @pytest.mark.parametrize(
@@ -162,7 +148,7 @@ def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> No
         ("::", "fd00::5", "[fd00::6]:80", False),
     ],
 )
-def test_another_host_is_served_by_its_addresses(bound: str, reached: str, host: str, let_in: bool) -> None:
+def test_another_host_is_served_by_its_addresses(bound, reached, host, let_in):
     from websockets.datastructures import Headers as Given
 
     access = Access(bound)
@@ -235,9 +221,20 @@ def test_an_exported_page_and_a_log_hold_no_key(app: App, tmp_path: Path) -> Non
     assert f":{app.server.get_port()}" not in html
 
 
+def camera(*values: object) -> dict[str, object]:
+    """The message of a page's camera with these values for all its fields."""
+    fields = [name for name in CAMERA.as_serializable_dict() if name != "type"]
+    return {"type": "ViewerCameraMessage", **dict(zip(fields, values, strict=True))}
+
+
 def nonsense(uuid: str) -> dict[str, bytes | str]:
     """What a page may send that makes no sense; `uuid` of a slider."""
     update = {"type": "GuiUpdateMessage", "uuid": uuid}
+    upload = {"type": "FileTransferStartUpload", "source_component_uuid": uuid, "transfer_uuid": "t"}
+    upload |= {"filename": "f", "mime_type": "m", "part_count": 0, "size_bytes": 0}
+    drag = {"type": "SceneNodeDragMessage", "phase": "update", "name": "/drag_handle", "instance_index": None}
+    drag |= {"start_position": [0.0] * 3, "start_screen_pos": [0.0] * 2, "end_position": [float("nan")] * 3}
+    drag |= {"end_screen_pos": [0.0] * 2, "button": "left", "modifier": None, "owner": ""}
     messages: dict[str, object] = {
         "a number": 7,
         "a list": [1, 2],
@@ -253,53 +250,11 @@ def nonsense(uuid: str) -> dict[str, bytes | str]:
         "far beyond": {**update, "updates": {"value": 1e9}},
         "an attribute": {**update, "updates": {"update_cb": []}},
         "an attribute that is none": {**update, "updates": {"nope": 1}},
-        "a file for a slider": {
-            "type": "FileTransferStartUpload",
-            "source_component_uuid": uuid,
-            "transfer_uuid": "t",
-            "filename": "f",
-            "mime_type": "m",
-            "part_count": 0,
-            "size_bytes": 0,
-        },
+        "a file for a slider": upload,
         "a tunnel": {"type": "ShareUrlRequest"},
-        "a camera of words": {
-            "type": "ViewerCameraMessage",
-            "wxyz": ["a"] * 4,
-            "position": None,
-            "fov": "wide",
-            "near": [],
-            "far": {},
-            "image_height": "x",
-            "image_width": "y",
-            "look_at": 3,
-            "up_direction": "up",
-        },
-        "a camera of the wrong sizes": {
-            "type": "ViewerCameraMessage",
-            "wxyz": [1.0],
-            "position": [],
-            "fov": 1.0,
-            "near": 1.0,
-            "far": 1.0,
-            "image_height": 1,
-            "image_width": 0,
-            "look_at": [0.0],
-            "up_direction": [1.0],
-        },
-        "a drag to nowhere": {
-            "type": "SceneNodeDragMessage",
-            "phase": "update",
-            "name": "/drag_handle",
-            "instance_index": None,
-            "start_position": [0.0] * 3,
-            "start_screen_pos": [0.0] * 2,
-            "end_position": [float("nan")] * 3,
-            "end_screen_pos": [0.0] * 2,
-            "button": "left",
-            "modifier": None,
-            "owner": "",
-        },
+        "a camera of words": camera(["a"] * 4, None, "wide", [], {}, "x", "y", 3, "up"),
+        "a camera of the wrong sizes": camera([1.0], [], 1.0, 1.0, 1.0, 1, 0, [0.0], [1.0]),
+        "a drag to nowhere": drag,
     }
     raw = {"text": "hello", "nothing": b"", "noise": np.random.default_rng(5).bytes(4000)}
     return raw | {name: msgspec.msgpack.encode(message) for name, message in messages.items()}
@@ -415,8 +370,7 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     one, two = RawPage(app), RawPage(app)
 
     def answered(by: RawPage) -> None:
-        """All that this page has sent before was dealt with: a stop from it, and from the other, is what
-        comes after."""
+        """All that this page sent before was dealt with: its stop, after the other's, comes last."""
         by.press(page.stop)
         assert until(lambda: page.session.stopped)
 
@@ -429,7 +383,7 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     two.key("Bend toward +x")
     two.put(page.run, "Reset")
     assert until(lambda: other.value == 0.0 and bend.value == 20.0)  # they go back
-    np.testing.assert_array_equal(link.read().dl, before)
+    assert_array_equal(link.read().dl, before)
     answered(two)  # the one that may not drive stops
     assert link.stopped
     two.press(page.go_on)

@@ -1,8 +1,6 @@
 """Tasks with arms in PyBullet worlds: episodes that depend on their draws alone, baselines that solve them,
 geometry against PyBullet's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,8 @@ from fastrod.errors import InputError
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 
+from environments import to_the_end
+
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.task import size
 from fastrod_envs.vector import BatchEnv
@@ -21,78 +21,52 @@ from fastrod_envs.vector import BatchEnv
 NAMES = ("BoxExplore", "PickPlace", "DualArm")
 
 
-def rollout(
-    env: SingleEnv, seed: int, n_steps: int = 25, *, scripted: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
-    """Observations and rewards of an episode's first steps, with the baseline's actions or with random
-    ones."""
+def rollout(env: SingleEnv, seed: int, n_steps: int = 25, *, scripted: bool = True) -> np.ndarray:
+    """Observations of an episode's first steps, with the baseline's actions or with random ones."""
     rng = np.random.default_rng(seed)
-    seen, rewards = [env.reset(seed=seed)[0]], []
+    seen = [env.reset(seed=seed)[0]]
     for _ in range(n_steps):
         action = env.baseline() if scripted else rng.uniform(-1.0, 1.0, env.action_space.shape)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, _ = env.step(action)
         seen.append(observation)
-        rewards.append(reward)
         if terminated or truncated:
             break
-    return np.array(seen), np.array(rewards)
+    return np.array(seen)
 
 
-def last_info(name: str, seed: int, **options: Any) -> dict[str, Any]:
-    """How the baseline's episode ends."""
-    env = SingleEnv(name, threads=1, **options)
-    env.reset(seed=seed)
-    done = False
-    while not done:
-        _, _, terminated, truncated, info = env.step(env.baseline())
-        done = terminated or truncated
-    env.close()
-    return info
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_episode_is_the_same_bit_for_bit_whatever_came_before(name: str) -> None:
-    fresh, used = SingleEnv(name, threads=1), SingleEnv(name, threads=1)
-    expected = rollout(fresh, seed=5)
-    rollout(used, seed=1, n_steps=60)
-    rollout(used, seed=2, n_steps=13, scripted=False)
-    again = rollout(used, seed=5)
-    assert_array_equal(again[0], expected[0])
-    assert_array_equal(again[1], expected[1])
-    assert np.ptp(expected[0], axis=0).any(), "nothing moved"
-    fresh.close()
-    used.close()
+@pytest.fixture
+def single(opened):
+    """Makes one environment on one thread."""
+    return lambda name, **options: opened(SingleEnv(name, threads=1, **options))
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "randomise", [None, {"bending_stiffness": (0.9, 1.1), "backlash.half_width": (0.0, 1e-5)}]
 )
-def test_an_environment_of_a_batch_is_the_single_one_of_its_seed(name: str, randomise: Any) -> None:
-    batch, single = (
-        BatchEnv(name, num_envs=3, threads=1, randomise=randomise),
-        SingleEnv(name, threads=1, randomise=randomise),
-    )
+def test_an_environment_of_a_batch_is_the_single_one_of_its_seed(name, randomise, single, opened):
+    batch = opened(BatchEnv(name, num_envs=3, threads=1, randomise=randomise))
+    env = single(name, randomise=randomise)
     seen, _ = batch.reset(seed=7)
-    alone, _ = single.reset(seed=9)
+    alone, _ = env.reset(seed=9)
     assert_array_equal(seen[2], alone)
     for _ in range(15):
         actions = batch.baseline()
-        assert_array_equal(actions[2], single.baseline())
+        assert_array_equal(actions[2], env.baseline())
         seen, rewards, _, _, _ = batch.step(actions)
-        alone, reward, terminated, _, _ = single.step(actions[2])
+        alone, reward, terminated, _, _ = env.step(actions[2])
         assert_array_equal(seen[2], alone)
         assert rewards[2] == reward
         if terminated:
             break
-    batch.close()
-    single.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_baseline_solves_the_task(name: str, seed: int) -> None:
-    info = last_info(name, seed)
+def test_the_baseline_solves_the_task(name, seed, single):
+    env = single(name)
+    env.reset(seed=seed)
+    info = to_the_end(env)[4]
     assert info["success"]
     assert not info["contact"]
     assert not info["lost"]
@@ -100,8 +74,8 @@ def test_the_baseline_solves_the_task(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("action", ["rate", "displacement"])
-def test_random_actions_leave_numbers_finite_and_within_their_bounds(name: str, action: str) -> None:
-    env = SingleEnv(name, threads=1, action=action)
+def test_random_actions_leave_numbers_finite_and_within_their_bounds(name, action, single):
+    env = single(name, action=action)
     rng = np.random.default_rng(3)
     low, high = env.observation_space.low, env.observation_space.high
     env.reset(seed=0)
@@ -117,44 +91,49 @@ def test_random_actions_leave_numbers_finite_and_within_their_bounds(name: str, 
         if terminated or truncated:
             env.reset()
     assert n_lost == 0
-    env.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "options", [{"n_steps": 1}, {"n_steps": 1, "action": "displacement"}, {"observation": "goal"}]
 )
-def test_options_of_every_task(name: str, options: dict[str, Any]) -> None:
-    env = SingleEnv(name, threads=1, **options)
+def test_options_of_every_task(name, options, single):
+    env = single(name, **options)
     parts = env.task.goals if options.get("observation") == "goal" else env.task.states
     observation, _ = env.reset(seed=0)
     assert observation.shape == (size(parts),)
     assert env.observation_space.contains(observation)
     _, _, terminated, truncated, _ = env.step(env.baseline())
     assert (terminated or truncated) == ("n_steps" in options)
-    env.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_stiffer_robot_moves_otherwise(name: str) -> None:
-    plain = SingleEnv(name, threads=1)
-    soft = SingleEnv(name, threads=1, randomise={"bending_stiffness": (0.8, 0.8)})
-    a, b = rollout(plain, seed=0, n_steps=5)[0], rollout(soft, seed=0, n_steps=5)[0]
+def test_a_stiffer_robot_moves_otherwise(name, single):
+    plain, soft = single(name), single(name, randomise={"bending_stiffness": (0.8, 0.8)})
+    a, b = rollout(plain, seed=0, n_steps=5), rollout(soft, seed=0, n_steps=5)
     assert a.shape == b.shape
     assert (a[-1] != b[-1]).any()
-    with pytest.raises(InputError, match="no parameter"):
-        SingleEnv(name, randomise={"colour": (0.9, 1.1)})
-    plain.close()
-    soft.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "sentence"),
+    [
+        *((name, {"randomise": {"colour": (0.9, 1.1)}}, "no parameter") for name in NAMES),
+        ("BoxExplore", {"camera": 3}, "camera"),
+        ("PickPlace", {"grip": "magnet"}, "grip"),
+    ],
+)
+def test_options_that_a_task_does_not_have_are_refused(name, options, sentence):
+    with pytest.raises(InputError, match=sentence):
+        SingleEnv(name, **options)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_is_drawn_and_taken_apart(name: str) -> None:
-    env = SingleEnv(name, threads=1)
+def test_it_is_drawn_and_taken_apart(name, single):
+    env = single(name)
     env.reset(seed=0)
     picture = env.task.picture(0, 64, 48)
     backdrop = env.task.backdrop(0)
-    env.close()
     assert picture is not None
     assert picture.shape == (48, 64, 3)
     assert picture.dtype == np.uint8
@@ -166,8 +145,8 @@ def test_it_is_drawn_and_taken_apart(name: str) -> None:
         assert solid.faces.max() < len(solid.vertices)
 
 
-def test_clearance_in_the_box_is_pybullets() -> None:
-    env = SingleEnv("BoxExplore", threads=1)
+def test_clearance_in_the_box_is_pybullets(single):
+    env = single("BoxExplore")
     found, expected = [], []
     for seed in range(4):
         rollout(env, seed, n_steps=20, scripted=seed % 2 == 0)
@@ -180,21 +159,17 @@ def test_clearance_in_the_box_is_pybullets() -> None:
     # the capsules' axes are chords: with nodes every 1 cm and bends of 1.7 rad in 0.1 m they sag by less than
     # 0.01^2 * 17 / 8 m
     assert_allclose(found, expected, atol=3e-4)
-    env.close()
 
 
-def test_the_camera_finds_the_cube_where_the_line_of_sight_ends() -> None:
-    env = SingleEnv("BoxExplore", threads=1, camera=True)
-    seen, _ = rollout(env, seed=0, n_steps=40)
+def test_the_camera_finds_the_cube_where_the_line_of_sight_ends(single):
+    env = single("BoxExplore", camera=True)
+    seen = rollout(env, seed=0, n_steps=40)
     assert np.abs(seen[-1, -3:-1]).max() < 0.15
     assert seen[-1, -1] > 0.0
-    env.close()
-    with pytest.raises(InputError, match="camera"):
-        SingleEnv("BoxExplore", camera=3)
 
 
-def test_touching_a_wall_ends_the_episode() -> None:
-    env = SingleEnv("BoxExplore", threads=1)
+def test_touching_a_wall_ends_the_episode(single):
+    env = single("BoxExplore")
     env.reset(seed=0)
     action = np.tile([1.0, 1.0, 0.0], 3)
     for _ in range(40):
@@ -205,12 +180,11 @@ def test_touching_a_wall_ends_the_episode() -> None:
     assert info["contact"]
     assert info["clearance"] < 0.0
     assert info["reward_terms"]["contact"] == -1.0
-    env.close()
 
 
 @pytest.mark.parametrize("grip", ["suction", "gripper"])
-def test_the_cube_is_lifted_carried_and_left_at_rest(grip: str) -> None:
-    env = SingleEnv("PickPlace", threads=1, grip=grip)
+def test_the_cube_is_lifted_carried_and_left_at_rest(grip, single):
+    env = single("PickPlace", grip=grip)
     env.reset(seed=1)
     heights, held = [], []
     for _ in range(60):
@@ -223,14 +197,11 @@ def test_the_cube_is_lifted_carried_and_left_at_rest(grip: str) -> None:
     assert info["success"]
     assert info["distance"] == pytest.approx(float(np.linalg.norm(info["position"] - info["desired"])))
     assert info["speed"] < 0.001
-    env.close()
-    with pytest.raises(InputError, match="grip"):
-        SingleEnv("PickPlace", grip="magnet")
 
 
 @pytest.mark.parametrize("grip", ["suction", "gripper"])
-def test_a_cube_that_is_let_go_in_the_air_falls_freely(grip: str) -> None:
-    env = SingleEnv("PickPlace", threads=1, grip=grip)
+def test_a_cube_that_is_let_go_in_the_air_falls_freely(grip, single):
+    env = single("PickPlace", grip=grip)
     env.reset(seed=1)
     cell: Any = env.task.cells[0]
     while cell.place[2] < cell.spot[2] + 0.05:
@@ -241,11 +212,10 @@ def test_a_cube_that_is_let_go_in_the_air_falls_freely(grip: str) -> None:
     # 0.1 s of free fall are 49 mm; the fingers let go after the first millimetres of their way, at 5 cm/s
     assert fallen > (0.03 if grip == "suction" else 0.005)
     assert not cell.held
-    env.close()
 
 
-def test_the_arm_moves_the_tip_as_told_while_the_soft_robot_bends() -> None:
-    env = SingleEnv("PickPlace", threads=1)
+def test_the_arm_moves_the_tip_as_told_while_the_soft_robot_bends(single):
+    env = single("PickPlace")
     env.reset(seed=0)
     cell: Any = env.task.cells[0]
     before = cell.soft.tip.copy()
@@ -256,11 +226,10 @@ def test_the_arm_moves_the_tip_as_told_while_the_soft_robot_bends() -> None:
     # it is horizontal
     assert_allclose(moved, [0.4 * 0.25 * 0.4, 0.0, 0.0], atol=0.012 * np.sin(0.7))
     assert cell.bend == pytest.approx(0.4, abs=0.31)
-    env.close()
 
 
-def test_the_ball_passes_from_one_robot_to_the_other() -> None:
-    env = SingleEnv("DualArm", threads=1)
+def test_the_ball_passes_from_one_robot_to_the_other(single):
+    env = single("DualArm")
     env.reset(seed=2)
     holders = []
     for _ in range(40):
@@ -271,11 +240,10 @@ def test_the_ball_passes_from_one_robot_to_the_other() -> None:
     assert (0.0, 0.0) not in holders, "nobody held it for a while"
     assert info["success"]
     assert info["distance"] < 0.01
-    env.close()
 
 
-def test_a_ball_that_is_let_go_falls_and_ends_the_episode() -> None:
-    env = SingleEnv("DualArm", threads=1)
+def test_a_ball_that_is_let_go_falls_and_ends_the_episode(single):
+    env = single("DualArm")
     env.reset(seed=0)
     start = env.task.outcome().position[0, 2]
     action = np.array([0.0] * 6 + [-1.0, -1.0])
@@ -284,26 +252,24 @@ def test_a_ball_that_is_let_go_falls_and_ends_the_episode() -> None:
     # the world's steps of h = 10 ms fall g t (t + h) / 2 in t = 0.2 s, if nothing is damped
     assert start - info["position"][2] == pytest.approx(0.5 * 9.81 * 0.2 * 0.21, rel=1e-3)
     assert info["reward_terms"]["failure"] == -1.0
-    env.close()
 
 
-def test_a_head_that_is_pulled_too_far_lets_go() -> None:
-    env = SingleEnv("DualArm", threads=1)
+def test_a_head_that_is_pulled_too_far_lets_go(single):
+    env = single("DualArm")
     env.reset(seed=2)
     cell: Any = env.task.cells[0]
     while not cell.held[1]:
         action = env.baseline()
         env.step(action)
-    both = np.array([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0])  # apart, both told to hold
+    both = np.array([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0])  # apart, both commanded to hold
     for _ in range(10):
         env.step(both)
     assert sum(cell.held) == 1
     assert cell.softs[1].tip[0] - cell.softs[0].tip[0] > 0.1
-    env.close()
 
 
-def test_tips_move_as_told() -> None:
-    env = SingleEnv("DualArm", threads=1)
+def test_tips_move_as_told(single):
+    env = single("DualArm")
     env.reset(seed=0)
     cell: Any = env.task.cells[0]
     before = np.stack([soft.tip for soft in cell.softs])
@@ -313,15 +279,14 @@ def test_tips_move_as_told() -> None:
     moved = np.stack([soft.tip for soft in cell.softs]) - before
     # 12 mm of way; damping and the curvature of the tips' paths take some of it
     assert_allclose(moved, 0.3 * 0.1 * velocity, atol=0.0015)
-    env.close()
 
 
 @pytest.mark.parametrize(
     ("name", "middle"),
     [("BoxExplore", None), ("PickPlace", (0.5, 0.04, 0.165)), ("DualArm", (0.06, 0.0, 0.3))],
 )
-def test_difficulty_goes_from_the_easiest_goals_to_all(name: str, middle: tuple[float, ...] | None) -> None:
-    task = SingleEnv(name, threads=1).task
+def test_difficulty_goes_from_the_easiest_goals_to_all(name, middle, single):
+    task = single(name).task
     draws = np.random.default_rng(0).random((12, task.n_draws))
     goals = []
     for level in (0.0, 1.0):
@@ -336,12 +301,11 @@ def test_difficulty_goes_from_the_easiest_goals_to_all(name: str, middle: tuple[
         assert np.ptp(easy[:, 0]) == 0.0, "a corner in the front is not easy"
     assert (np.ptp(every, axis=0)[:2] > 0.03).all()
     assert np.ptp(every, axis=0).sum() > np.ptp(easy, axis=0).sum()
-    task.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_draw_has_a_beginning(name: str) -> None:
-    task = SingleEnv(name, threads=1).task
+def test_every_draw_has_a_beginning(name, single):
+    task = single(name).task
     corners = np.random.default_rng(1).integers(0, 2, (25, task.n_draws)).astype(float)
     for row in corners:
         task.begin(np.array([0]), np.minimum(row, 1.0 - 1e-9)[None])
@@ -350,4 +314,3 @@ def test_every_draw_has_a_beginning(name: str) -> None:
         assert not outcome.lost[0]
         assert not outcome.terminated[0]
         assert not outcome.success[0]
-    task.close()

@@ -1,68 +1,46 @@
 """Catch: arcs against the simulator, the target's path, the load that nobody sees, and seeds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from environments import batch, drawn
 from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
-from fastrod.errors import InputError
-from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
-from fastrod_envs.single import SingleEnv
 from fastrod_envs.tasks import catch
 from fastrod_envs.tasks.catch import Catch, arcs_jacobian, arcs_tip, directions, standing_robot
 from fastrod_envs.vector import BatchEnv
 
 
-def task_of(env: BatchEnv | SingleEnv) -> Catch:
-    assert isinstance(env.task, Catch)
-    return env.task
-
-
-def rollout(n: int, seed: int, row: int, steps: int, **options) -> list[np.ndarray]:
-    """Observations and rewards of environment `row`, whose actions are the same whatever the others do; every
-    other one is at random."""
-    env = BatchEnv("Catch", num_envs=n, threads=1, **options)
-    own, others = np.random.default_rng(5), np.random.default_rng(n)
+def begun(n: int, seed: int = 0, **options: Any) -> tuple[BatchEnv, Catch]:
+    """Environments at the start of an episode, and their task."""
+    env = batch("Catch", n, **options)
     env.reset(seed=seed)
-    seen = []
-    for _ in range(steps):
-        action = others.uniform(-1, 1, (n, 5))
-        action[row] = own.uniform(-1, 1, 5)
-        observation, reward, *_ = env.step(action)
-        seen += [observation[row].copy(), np.array(reward[row])]
-    return seen
-
-
-def stiff_wires() -> Robot:
-    """The same robot with wires that hardly stretch."""
-    robot = standing_robot()
-    segments = [
-        replace(s, tendons=tuple(replace(t, compliance=1e-9) for t in s.tendons)) for s in robot.segments
-    ]
-    return replace(robot, segments=tuple(segments))
+    assert isinstance(env.task, Catch)
+    return env, env.task
 
 
 def test_arcs_are_the_unloaded_robot():
+    robot = standing_robot()
+    tendons = [tuple(replace(t, compliance=1e-9) for t in s.tendons) for s in robot.segments]
+    segments = (replace(s, tendons=own) for s, own in zip(robot.segments, tendons, strict=True))
+    stiff = replace(robot, segments=tuple(segments))
     displacement = np.random.default_rng(0).uniform(-0.8, 0.8, (6, 5)) * [0.012, 0.012, 0.012, 0.012, 0.02]
     actions = np.zeros((6, 6))
     actions[:, [1, 2, 4, 5, 3]] = displacement
-    wires = SegmentActions(standing_robot()).inputs(actions)
-    state = fastrod.Simulator(stiff_wires(), 6, points_per_segment=40).settle(**wires)
+    state = fastrod.Simulator(stiff, 6, points_per_segment=40).settle(**SegmentActions(robot).inputs(actions))
     assert_allclose(arcs_tip(displacement), state.tip_position, rtol=0, atol=1e-7)
 
 
 def test_jacobian_is_that_of_the_arcs():
     displacement = np.random.default_rng(1).uniform(-0.01, 0.01, (4, 5))
-    way = np.random.default_rng(2).uniform(-1e-5, 1e-5, (4, 5))
-    change = arcs_tip(displacement + way) - arcs_tip(displacement - way)
-    assert_allclose(
-        np.einsum("nij,nj->ni", arcs_jacobian(displacement), 2.0 * way), change, rtol=0, atol=1e-10
-    )
+    step = np.random.default_rng(2).uniform(-1e-5, 1e-5, (4, 5))
+    change = arcs_tip(displacement + step) - arcs_tip(displacement - step)
+    slopes = np.einsum("nij,nj->ni", arcs_jacobian(displacement), 2.0 * step)
+    assert_allclose(slopes, change, rtol=0, atol=1e-10)
 
 
 def test_directions_are_even_over_the_sphere():
@@ -74,9 +52,7 @@ def test_directions_are_even_over_the_sphere():
 
 
 def test_target_moves_in_a_straight_line_through_the_workspace():
-    env = BatchEnv("Catch", num_envs=50, threads=1)
-    env.reset(seed=0)
-    task = task_of(env)
+    _, task = begun(50)
     start, velocity = task.desired.copy(), task.velocity.copy()
     closest = np.full(50, np.inf)
     for k in range(1, 21):
@@ -90,9 +66,8 @@ def test_target_moves_in_a_straight_line_through_the_workspace():
 
 
 def test_the_load_bends_the_robot_and_is_not_observed():
-    env = BatchEnv("Catch", num_envs=40, threads=1)
+    env, task = begun(40)
     observation, _ = env.reset(seed=3)
-    task = task_of(env)
     load = np.linalg.norm(task.force, axis=1)
     assert 0.5 * catch.LARGEST_LOAD < load.max() <= catch.LARGEST_LOAD
     bent = task.tip - [0.0, 0.0, standing_robot().length]
@@ -104,9 +79,7 @@ def test_the_load_bends_the_robot_and_is_not_observed():
 
 
 def test_the_load_is_there_all_the_while():
-    env = BatchEnv("Catch", num_envs=3, threads=1)
-    env.reset(seed=0)
-    task = task_of(env)
+    _, task = begun(3)
     tip = task.tip.copy()
     for _ in range(5):
         task.act(np.zeros((3, 5)))
@@ -114,24 +87,21 @@ def test_the_load_is_there_all_the_while():
 
 
 def test_reward_is_its_formula_and_distance_the_least():
-    env = BatchEnv("Catch", num_envs=20, threads=1)
-    env.reset(seed=1)
-    rng, least = np.random.default_rng(0), np.linalg.norm(task_of(env).desired - task_of(env).tip, axis=1)
-    for _ in range(30):
-        _, reward, terminated, _, info = env.step(rng.uniform(-1, 1, (20, 5)))
+    env, task = begun(20, seed=1)
+    least = np.linalg.norm(task.desired - task.tip, axis=1)
+    for action in drawn(env, 30):
+        _, reward, terminated, _, info = env.step(action)
         d = np.linalg.norm(info["desired"] - info["position"], axis=1)
         least = np.minimum(least, d)
         assert_allclose(info["distance"], least, rtol=0, atol=1e-12)
         assert_allclose(reward, -np.minimum(d, 0.2) / 0.2 + 10.0 * (d <= 0.01), rtol=0, atol=1e-12)
         assert_array_equal(terminated, (d <= 0.01) | info["lost"])
-        task = task_of(env)
         least = np.where(terminated, np.linalg.norm(task.desired - task.tip, axis=1), least)
 
 
 @pytest.mark.parametrize("action", ["rate", "displacement"])
 def test_baseline_catches(action):
-    env = BatchEnv("Catch", num_envs=60, action=action, threads=1)
-    env.reset(seed=100)
+    env, _ = begun(60, seed=100, action=action)
     over, caught = np.zeros(60, bool), np.zeros(60, bool)
     for _ in range(env.n_steps):
         _, _, terminated, truncated, info = env.step(env.baseline())
@@ -142,72 +112,20 @@ def test_baseline_catches(action):
 
 
 def test_difficulty_0_has_no_load_and_a_target_that_comes_to_the_tip():
-    env = BatchEnv("Catch", num_envs=8, difficulty=0.0, threads=1)
-    env.reset(seed=0)
-    task = task_of(env)
+    env, task = begun(8, difficulty=0.0)
     assert_array_equal(task.force, 0.0)
     assert_allclose(np.linalg.norm(task.velocity, axis=1), catch.SLOWEST)
-    still = np.zeros((8, 5))
     for _ in range(env.n_steps):
-        env.step(still)
+        env.step(np.zeros((8, 5)))
         assert (task.least < 0.2).all()
         if (task.least <= 0.01).all():
             break
     assert task.least.max() < 0.05
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"action": "displacement"}, {"randomise": {"bending_stiffness": (0.8, 1.2)}}]
-)
-def test_a_seed_is_a_rollout_whatever_is_beside_it(options):
-    three, one = rollout(3, 7, 2, 50, **options), rollout(1, 9, 0, 50, **options)
-    for a, b in zip(three, one, strict=True):
-        assert_array_equal(a, b)
-
-
-def test_a_seed_is_a_rollout_whatever_came_before():
-    env, fresh = BatchEnv("Catch", num_envs=2, threads=1), BatchEnv("Catch", num_envs=2, threads=1)
-    env.reset(seed=0)
-    for _ in range(45):
-        env.step(np.random.default_rng(1).uniform(-1, 1, (2, 5)))
-    a, b = env.reset(seed=21)[0], fresh.reset(seed=21)[0]
-    assert_array_equal(a, b)
-    for _ in range(20):
-        action = fresh.baseline()
-        assert_array_equal(env.baseline(), action)
-        assert_array_equal(env.step(action)[0], fresh.step(action)[0])
-
-
-@pytest.mark.parametrize("options", [{}, {"action": "displacement"}, {"n_steps": 1}, {"observation": "goal"}])
-def test_random_actions_stay_within_the_bounds(options):
-    env = BatchEnv("Catch", num_envs=50, **options)
-    rng = np.random.default_rng(0)
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (50, 6 if "observation" in options else 20)
-    for _ in range(45):
-        seen = env.task.goal() if "observation" in options else env.task.state()
-        assert (seen >= env.single_observation_space.low - 1e-6).all()
-        assert (seen <= env.single_observation_space.high + 1e-6).all()
-        observation, reward, *_ = env.step(rng.uniform(-1, 1, (50, 5)))
-        assert np.isfinite(observation).all()
-        assert np.isfinite(reward).all()
-
-
 def test_effects_are_randomised_and_felt():
-    env = BatchEnv(
-        "Catch",
-        num_envs=20,
-        threads=1,
-        randomise={"bending_stiffness": (0.8, 1.2), "camera_scale.scale": (0.05, 0.1)},
-    )
-    env.reset(seed=0)
-    task = task_of(env)
+    env, task = begun(20, randomise={"bending_stiffness": (0.8, 1.2), "camera_scale.scale": (0.05, 0.1)})
     assert (np.linalg.norm(task.measured() - task.tip, axis=1) > 0.005).all()
     for _ in range(5):
         observation, *_ = env.step(env.baseline())
     assert np.isfinite(observation).all()
-
-
-def test_what_is_unknown_is_refused():
-    with pytest.raises(InputError, match="n_steps"):
-        SingleEnv("Catch", n_step=3)

@@ -1,7 +1,4 @@
-"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of
-its own."""
-
-from __future__ import annotations
+"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine of its own."""
 
 import contextlib
 import io
@@ -12,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bullets import soft_robot
+from numpy.testing import assert_allclose
 
 import fastrod.hosts
 from fastrod.contact import ContactScene, plane
@@ -20,25 +18,18 @@ from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_ve
 
 PAGE = (Path(fastrod.hosts.__file__).parent / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, flags=re.S)
-RECIPE = next(
-    block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S) if "def embedded_step" in block
-)
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.S)
+RECIPE = next(block for block in BLOCKS if "def embedded_step" in block)
 
 
 class TinyEngine:
     """One rigid body on a spring: x y z w, forces at the centre of mass, torque and inertia in the body
     frame, semi-implicit Euler."""
 
-    def __init__(
-        self, mass=1.0, inertia=(0.1, 0.2, 0.15), spring=0.0, twist=0.0, damping=0.0, gravity=0.0
-    ) -> None:
-        self.mass, self.inertia, self.spring, self.twist, self.damping = (
-            mass,
-            np.array(inertia),
-            spring,
-            twist,
-            damping,
-        )
+    mass, inertia = 1.0, np.array([0.1, 0.2, 0.15])
+
+    def __init__(self, spring=0.0, twist=0.0, damping=0.0, gravity=0.0) -> None:
+        self.spring, self.twist, self.damping = spring, twist, damping
         self.gravity = np.array([0.0, 0.0, -gravity])
         self.position, self.orientation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
         self.velocity, self.spin = np.zeros(3), np.zeros(3)
@@ -53,18 +44,13 @@ class TinyEngine:
 
     def step(self, dt) -> None:
         rotation = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
-        force = (
-            self._force
-            + self.mass * self.gravity
-            - self.spring * np.array(self.position)
-            - self.damping * self.velocity
-        )
+        held = self.spring * np.array(self.position) + self.damping * self.velocity
+        force = self._force + self.mass * self.gravity - held
         inertia = rotation @ np.diag(self.inertia) @ rotation.T
         moment = rotation @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
         self.velocity = self.velocity + dt * force / self.mass
-        self.spin = self.spin + dt * np.linalg.solve(
-            inertia, moment - np.cross(self.spin, inertia @ self.spin)
-        )
+        gyration = np.cross(self.spin, inertia @ self.spin)
+        self.spin = self.spin + dt * np.linalg.solve(inertia, moment - gyration)
         self.position = (np.array(self.position) + dt * self.velocity).tolist()
         turned = product(quaternion_from_vector(dt * self.spin), np.roll(self.orientation, 1))
         self.orientation = np.roll(turned / np.linalg.norm(turned), -1).tolist()
@@ -101,7 +87,7 @@ def test_rod_hangs_on_the_spring_with_its_weight_and_turns_it_with_its_moment(em
     state = rod.state
     middle = np.trapezoid(state.position[0], state.arclength[0], axis=0) / robot.length - body.position
     expected = np.cross(middle, [0.0, 0.0, -weight]) / 40.0
-    np.testing.assert_allclose(2.0 * np.arcsin(0.5 * body.vector()), expected, rtol=2e-3, atol=1e-6)
+    assert_allclose(2.0 * np.arcsin(0.5 * body.vector()), expected, rtol=2e-3, atol=1e-6)
     assert rod.time == pytest.approx(round(2.0 / dt) * dt)
 
 
@@ -111,7 +97,7 @@ def test_impulse_of_the_tip_force_is_the_bodys_momentum(embedded_step) -> None:
     force = np.array([0.02, 0.01, -0.03])
     for _ in range(100):
         embedded_step(rod, body, np.array([0.0, 0.02, 0.03]), 0.005, tip_force=force)
-    np.testing.assert_allclose(body.mass * body.velocity, 0.5 * force, rtol=1e-6)
+    assert_allclose(body.mass * body.velocity, 0.5 * force, rtol=1e-6)
     assert np.linalg.norm(body.spin) > 0.01  # and turns it
 
 
@@ -138,7 +124,7 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
     rotation = matrix_from_quaternion(np.array([[half, half, 0.0, 0.0]]))[0]
     embedded_step(rod, body, offset, 0.001)
     moment = rotation.T @ (rod.wrench[3:] + np.cross(rotation @ offset, rod.wrench[:3]))
-    np.testing.assert_allclose(rotation.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
+    assert_allclose(rotation.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
     assert np.abs(moment).max() > 0.05
 
 
@@ -146,10 +132,8 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
 def test_limit_of_the_time_step_is_where_the_page_has_it(fraction: float, calm: bool) -> None:
     # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
     robot, dt, rotation = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
-    scene = ContactScene(
-        obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)]
-    )
-    rod = Rod(robot, dt=dt, contact=scene)
+    floor = plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)
+    rod = Rod(robot, dt=dt, contact=ContactScene(obstacles=[floor]))
     start = 0.006
 
     def press(z: float) -> float:

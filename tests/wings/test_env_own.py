@@ -1,7 +1,4 @@
-"""Tasks and robots of users: a package with one file and one entry point, a class without either, a robot
-file."""
-
-from __future__ import annotations
+"""Tasks and robots of users: a package with an entry point, a class without one, a robot file."""
 
 import re
 import sys
@@ -81,16 +78,20 @@ class Aim(RodTask):
 '''
 
 
+def install(folder: Path, module: str, code: str, task: str) -> None:
+    """A package as it lies once it is installed: one file, and its entry point."""
+    (folder / f"{module}.py").write_text(code)
+    about = folder / f"{module}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[fastrod.tasks]\n{task} = {module}\n")
+
+
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A package with the task Aim as it lies once it is installed: one file, and its entry point."""
+    """A package with the task Aim."""
     folder = tmp_path_factory.mktemp("site")
-    (folder / "aiming.py").write_text(AIM)
-    (folder / "aiming-1.0.dist-info").mkdir()
-    (folder / "aiming-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: aiming\nVersion: 1.0\n"
-    )
-    (folder / "aiming-1.0.dist-info" / "entry_points.txt").write_text("[fastrod.tasks]\naim = aiming\n")
+    install(folder, "aiming", AIM, "aim")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         registration.load_plug_ins.cache_clear()
@@ -139,12 +140,10 @@ def test_a_baseline_by_the_angular_jacobian_succeeds(package: Path) -> None:
 def test_bad_input_of_an_own_task_is_refused_as_any(package: Path) -> None:
     batch = BatchEnv("Aim", 2, threads=1)
     batch.reset(seed=0)
-    for action, words in (
-        (np.zeros((2, 3)), "actions have shape (2, 3); they must be (2, 2)"),
-        (np.full((2, 2), np.nan), "the action of environment 0 is not finite"),
-    ):
-        with pytest.raises(InputError, match=re.escape(words)):
-            batch.step(action)
+    with pytest.raises(InputError, match=r"actions have shape \(2, 3\); they must be \(2, 2\)"):
+        batch.step(np.zeros((2, 3)))
+    with pytest.raises(InputError, match="the action of environment 0 is not finite"):
+        batch.step(np.full((2, 2), np.nan))
     with pytest.raises(InputError, match="no option 'stepz'"):
         BatchEnv("Aim", 2, stepz=3)
     with pytest.raises(UnknownNameError, match="no environment 'Aimm'; did you mean 'Aim'"):
@@ -152,17 +151,15 @@ def test_bad_input_of_an_own_task_is_refused_as_any(package: Path) -> None:
 
 
 def test_a_class_needs_no_registration(package: Path) -> None:
-    kind = type(
-        "Closer", (registration.task_class("Aim"),), {"name": "Closer", "accuracy": 0.001, "__doc__": "."}
-    )
+    fields = {"name": "Closer", "accuracy": 0.001, "__doc__": "."}
+    kind = type("Closer", (registration.task_class("Aim"),), fields)
     batch = BatchEnv(kind, 2, threads=1)
     observation, _ = batch.reset(seed=3)
     assert_array_equal(observation, BatchEnv("Aim", 2, threads=1).reset(seed=3)[0])
     assert batch.task.accuracy == 0.001
     assert "Closer" not in fastrod_envs.names()
-    assert (
-        fastrod_envs.register(kind) is fastrod_envs.register(kind) is kind
-    )  # registered again, it is replaced
+    # registered again, it is replaced
+    assert fastrod_envs.register(kind) is fastrod_envs.register(kind) is kind
     assert gymnasium.make("fastrod/Closer-v0", threads=1).unwrapped.task.accuracy == 0.001
     fastrod_envs.unregister("Closer")
     assert "fastrod/Closer-v0" not in gymnasium.registry
@@ -172,49 +169,37 @@ def variant(**given: Any) -> Any:
     return type("Other", (registration.task_class("Aim"),), {"name": "Other", **given})
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: 3, "the task is 3; give a name, or a class derived from fastrod_envs.task.Task."),
-        (
-            lambda: int,
-            "the task is <class 'int'>; give a name, or a class derived from fastrod_envs.task.Task.",
-        ),
-        (
-            lambda: variant(name="Reach"),
-            "a task named 'Reach' is already registered, fastrod_envs.tasks.reach:Reach",
-        ),
-        (lambda: variant(name="my task"), "Other.name is 'my task'; it must be one word"),
-        (lambda: variant(n_steps=0), "Other has n_steps 0 and n_draws 2; an episode has at least one step"),
-        (lambda: variant(n_draws="two"), "Other.n_draws is 'two'; it must be of type int."),
-        (
-            lambda: registration.task_class("Aim").__mro__[1],
-            "task RodTask is not complete; it lacks backdrop, baseline, begin",
-        ),
-    ],
-)
-def test_what_is_no_task_is_refused_in_a_sentence(package: Path, make: Any, sentence: str) -> None:
+GIVE = "give a name, or a class derived from fastrod_envs.task.Task."
+NO_TASKS = {
+    f"the task is 3; {GIVE}": lambda: 3,
+    f"the task is <class 'int'>; {GIVE}": lambda: int,
+    "a task named 'Reach' is already registered, fastrod_envs.tasks.reach:Reach": lambda: variant(
+        name="Reach"
+    ),
+    "Other.name is 'my task'; it must be one word": lambda: variant(name="my task"),
+    "Other has n_steps 0 and n_draws 2; an episode has at least one step": lambda: variant(n_steps=0),
+    "Other.n_draws is 'two'; it must be of type int.": lambda: variant(n_draws="two"),
+    "task RodTask is not complete; it lacks backdrop, baseline, begin": lambda: registration.task_class(
+        "Aim"
+    ).__mro__[1],
+}
+
+
+@pytest.mark.parametrize("sentence", NO_TASKS)
+def test_what_is_no_task_is_refused_in_a_sentence(package: Path, sentence: str) -> None:
     before = fastrod_envs.names()
     with pytest.raises(InputError, match=re.escape(sentence)) as caught:
-        fastrod_envs.register(make())
+        fastrod_envs.register(NO_TASKS[sentence]())
     assert "\n" not in str(caught.value)
     assert fastrod_envs.names() == before
 
 
-def test_a_package_that_cannot_be_imported_takes_nothing_else_away(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "broken.py").write_text("raise ValueError('no such camera')\n")
-    (tmp_path / "broken-1.0.dist-info").mkdir()
-    (tmp_path / "broken-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n"
-    )
-    (tmp_path / "broken-1.0.dist-info" / "entry_points.txt").write_text("[fastrod.tasks]\nmine = broken\n")
+def test_a_package_that_cannot_be_imported_takes_nothing_else_away(tmp_path, monkeypatch):
+    install(tmp_path, "broken", "raise ValueError('no such camera')\n", "mine")
     monkeypatch.syspath_prepend(str(tmp_path))
     registration.load_plug_ins.cache_clear()
-    with pytest.warns(
-        UserWarning, match=r"the tasks of 'broken' are missing: ValueError\('no such camera'\)"
-    ):
+    sentence = r"the tasks of 'broken' are missing: ValueError\('no such camera'\)"
+    with pytest.warns(UserWarning, match=sentence):
         registration.load_plug_ins()
     assert "Reach" in fastrod_envs.names()
 
@@ -244,11 +229,10 @@ def test_reach_takes_a_robot_file(name: str, tmp_path: Path) -> None:
 def test_reach_with_a_robot_file_is_a_gymnasium_environment(tmp_path: Path) -> None:
     robot = replace(fastrod.load_robot("tdcr_b"), effects=({"name": "backlash", "half_width": 1e-4},))
     fastrod.save_robot(robot, tmp_path / "mine.toml")
-    env = gymnasium.make("fastrod/Reach-v0", robot=tmp_path / "mine.toml", threads=1, reward="precise")
+    given = {"robot": tmp_path / "mine.toml", "threads": 1}
+    env = gymnasium.make("fastrod/Reach-v0", reward="precise", **given)
     check_env(env.unwrapped, skip_render_check=True)
-    picture = gymnasium.make(
-        "fastrod/Reach-v0", robot=tmp_path / "mine.toml", threads=1, render_mode="rgb_array"
-    )
+    picture = gymnasium.make("fastrod/Reach-v0", render_mode="rgb_array", **given)
     picture.reset(seed=0)
     assert np.ptp(picture.render()) > 0
     easiest = {tuple(env.reset(seed=s, options={"difficulty": 0.0})[0][:3]) for s in range(4)}

@@ -1,99 +1,37 @@
-"""The same seed gives the same rollout, bit for bit: whatever stands beside an environment, and whatever
-happened in it before."""
+"""The same seed gives the same rollout, bit for bit, whatever stands beside it and came before it."""
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from environments import NAMES, alone, assert_same, batch, drawn, together
 from numpy.testing import assert_array_equal
 
-import fastrod_envs
 from fastrod.errors import InputError
 from fastrod_envs.registration import task_class
 from fastrod_envs.vector import BatchEnv
 
-NAMES = fastrod_envs.names()
 ROD_NAMES = tuple(name for name in NAMES if not task_class(name).hosted)
+STIFFNESS = {"bending_stiffness": (0.8, 1.2)}
 VARIED: dict[str, dict[str, Any]] = {
     "state": {},
     "goal": {"observation": "goal"},
     "displacement": {"action": "displacement", "n_steps": 3},
-    "parameters": {"randomise": {"bending_stiffness": (0.8, 1.2), "line_density": (1.0, 1.5)}},
+    "parameters": {"randomise": {**STIFFNESS, "line_density": (1.0, 1.5)}},
     "effects": {"randomise": {"backlash.half_width": (0.0, 3e-4), "bending_stiffness": (0.9, 1.1)}},
 }
 
 
-class Rollout(NamedTuple):
-    """What one environment did."""
-
-    observations: np.ndarray
-    """(n + 1, n_obs) with the first; where an episode ended its first, not its last one."""
-    rewards: np.ndarray
-    """(n,)"""
-    endings: np.ndarray
-    """(n,) bool"""
-    positions: np.ndarray
-    """(n, 3) what info says of every step, the last of an episode included."""
-
-
-def actions(env: BatchEnv, n: int) -> np.ndarray:
-    """(n, num_envs, n_actions)."""
-    return np.random.default_rng(99).uniform(-1.0, 1.0, (n, *env.action_space.shape))
-
-
-def alone(env: gymnasium.Env[Any, Any], given: np.ndarray, seed: int) -> Rollout:
-    """An environment by itself through several episodes."""
-    observation, _ = env.reset(seed=seed)
-    observations, rewards, endings, positions = [observation], [], [], []
-    for action in given:
-        observation, reward, terminated, truncated, info = env.step(action)
-        positions.append(info["position"])
-        if terminated or truncated:
-            observation, _ = env.reset()
-        observations.append(observation)
-        rewards.append(reward)
-        endings.append(terminated or truncated)
-    return Rollout(*map(np.array, (observations, rewards, endings, positions)))
-
-
-def together(env: BatchEnv, given: np.ndarray, seed: int) -> list[Rollout]:
-    """Environments beside each other; `given` (n, num_envs, n_actions)."""
-    observation, _ = env.reset(seed=seed)
-    observations, rewards, endings, positions = [observation], [], [], []
-    for action in given:
-        observation, reward, terminated, truncated, info = env.step(action)
-        positions.append(info["position"])
-        observations.append(observation)
-        rewards.append(reward)
-        endings.append(terminated | truncated)
-    columns = zip(
-        *(np.swapaxes(np.array(a), 0, 1) for a in (observations, rewards, endings, positions)), strict=True
-    )
-    return [Rollout(*column) for column in columns]
-
-
-def assert_same(one: Rollout, other: Rollout) -> None:
-    for a, b in zip(one, other, strict=True):
-        assert_array_equal(a, b)
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_an_environment_does_not_know_its_neighbours(name: str) -> None:
-    hosted = task_class(name).hosted
-    if hosted:
-        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
-    # worlds of rigid bodies take their time
+def test_an_environment_does_not_know_its_neighbours(name, opened):
+    hosted = task_class(name).hosted  # worlds of rigid bodies take their time
     n, steps, options = (2, 4, {"n_steps": 2}) if hosted else (3, 12, {"n_steps": 4})
-    options["threads"] = 1
-    env = BatchEnv(name, n, **options)
-    given = actions(env, steps)
+    env = opened(batch(name, n, **options))
+    given = drawn(env, steps, seed=99)
     found = together(env, given, seed=40)
     assert_same(found[1], together(env, given, seed=40)[1])  # after other episodes
-    env.close()
-    single = gymnasium.make(f"fastrod/{name}-v0", **options)
+    single = opened(gymnasium.make(f"fastrod/{name}-v0", threads=1, **options))
     single.reset(seed=1)
     single.step(given[0, 0])  # left in the middle of an episode
     for i in (1,) if hosted else (2, 0):
@@ -101,13 +39,12 @@ def test_an_environment_does_not_know_its_neighbours(name: str) -> None:
         assert_same(found[i], rollout)
         assert rollout.endings.sum() >= 2
     assert not np.array_equal(found[0].observations[0], found[1].observations[0])
-    single.close()
 
 
 @pytest.mark.parametrize("name", ROD_NAMES)
 def test_three_are_the_first_three_of_seventeen(name: str) -> None:
-    few, many = (BatchEnv(name, n, n_steps=5, threads=1) for n in (3, 17))
-    given = actions(many, 8)
+    few, many = (batch(name, n, n_steps=5) for n in (3, 17))
+    given = drawn(many, 8, seed=99)
     ones, others = together(few, given[:, :3], seed=7), together(many, given, seed=7)
     for one, other in zip(ones, others, strict=False):
         assert_same(one, other)
@@ -118,7 +55,7 @@ def test_three_are_the_first_three_of_seventeen(name: str) -> None:
 def test_options_keep_that_promise(varied: str) -> None:
     options = {"n_steps": 5, "threads": 1, **VARIED[varied]}
     env = BatchEnv("Reach", 4, **options)
-    given = actions(env, 12)
+    given = drawn(env, 12, seed=99)
     found = together(env, given, seed=21)
     single = gymnasium.make("fastrod/Reach-v0", **options)
     for i in (3, 1):
@@ -126,15 +63,61 @@ def test_options_keep_that_promise(varied: str) -> None:
     assert found[0].endings.sum() >= 2
 
 
+RANDOMISED = {"randomise": STIFFNESS}
+BESIDE = [
+    *(("Catch", 50, "distance", options) for options in ({}, {"action": "displacement"}, RANDOMISED)),
+    *(("TubeInsert", 45, "largest_force", options) for options in ({}, RANDOMISED)),
+    *(("QuadrupedPush", 12, "position", options) for options in ({}, {"action": "displacement"}, RANDOMISED)),
+]
+FORWARD = {"Catch": 0.0, "TubeInsert": (0.0, 0.0, 0.0, 0.0, 0.5), "QuadrupedPush": (0.1, 0.5, 0.0)}
+"""With this, random actions meet the wall or the cube."""
+
+
+@pytest.mark.parametrize(("name", "steps", "key", "options"), BESIDE)
+def test_a_seed_is_a_rollout_whatever_is_beside_it(name, steps, key, options, opened):
+    """Bit for bit, with contacts, and through the ends of episodes."""
+    three, one = opened(batch(name, 3, **options)), opened(batch(name, 1, **options))
+    given = np.clip(FORWARD[name] + drawn(three, steps, seed=5), -1.0, 1.0)
+    beside = together(three, given, 7, key)
+    together(one, drawn(one, 20, seed=1), 99)  # another episode before
+    assert_same(beside[2], together(one, given[:, 2:], 9, key)[0])
+    for found, again in zip(beside, together(three, given, 7, key), strict=True):
+        assert_same(found, again)
+    assert not np.array_equal(beside[0].observations, beside[1].observations)
+    if key == "largest_force":
+        assert beside[2].reported.max() > 0.0
+
+
+@pytest.mark.parametrize("name", ["Catch", "TubeInsert", "BoxExplore", "PickPlace", "DualArm"])
+def test_a_seed_is_a_rollout_whatever_came_before(name, opened):
+    fresh, used = (opened(batch(name, 1 if task_class(name).hosted else 2)) for _ in range(2))
+    used.reset(seed=1)
+    for _ in range(60):
+        used.step(used.baseline())
+    used.reset(seed=2)
+    for action in drawn(used, 13):
+        used.step(action)
+    seen = [used.reset(seed=21)[0]]
+    assert_array_equal(seen[0], fresh.reset(seed=21)[0])
+    for _ in range(25):
+        action = fresh.baseline()
+        assert_array_equal(used.baseline(), action)
+        (observation, reward, *_), expected = used.step(action), fresh.step(action)
+        assert_array_equal(observation, expected[0])
+        assert_array_equal(reward, expected[1])
+        seen.append(observation)
+    assert np.ptp(seen, axis=0).any(), "nothing moved"
+
+
 def test_many_threads_are_one() -> None:
-    few, many = (BatchEnv("Reach", 64, n_steps=5, threads=threads) for threads in (1, None))
-    given = actions(few, 12)
+    few, many = (batch("Reach", 64, n_steps=5, threads=threads) for threads in (1, None))
+    given = drawn(few, 12, seed=99)
     for one, other in zip(together(few, given, seed=3), together(many, given, seed=3), strict=True):
         assert_same(one, other)
 
 
 def test_each_may_have_a_seed_of_its_own() -> None:
-    env = BatchEnv("Reach", 3, threads=1)
+    env = batch("Reach", 3)
     first, _ = env.reset(seed=[5, 9, 5])
     assert_array_equal(first[0], first[2])
     assert not np.array_equal(first[0], first[1])
@@ -144,23 +127,23 @@ def test_each_may_have_a_seed_of_its_own() -> None:
     again, _ = env.reset(seed=[5, None, None])
     assert_array_equal(again[0], first[0])
     assert not np.array_equal(again[1], first[1])
-    unseeded = BatchEnv("Reach", 2, threads=1).reset()[0]
+    unseeded = batch("Reach").reset()[0]
     assert not np.array_equal(unseeded[0], unseeded[1])
 
 
 @pytest.mark.parametrize("seed", [-1, True, 1.5, [1, 2], [1, 2, "3"]])
 def test_a_seed_is_a_whole_number(seed: Any) -> None:
     with pytest.raises(InputError, match="seed"):
-        BatchEnv("Reach", 3, threads=1).reset(seed=[seed] * 3 if isinstance(seed, bool | float) else seed)
+        batch("Reach", 3).reset(seed=[seed] * 3 if isinstance(seed, bool | float) else seed)
 
 
 def test_numpys_seeds_do_not_overflow() -> None:
-    env = BatchEnv("Reach", 2, threads=1)
+    env = batch("Reach")
     assert_array_equal(env.reset(seed=np.uint8(255))[0], env.reset(seed=255)[0])
 
 
 def test_a_masked_reset_seeds_those_that_begin() -> None:
-    seeded, other = (BatchEnv("Reach", 2, n_steps=2, threads=1) for _ in range(2))
+    seeded, other = (batch("Reach", n_steps=2) for _ in range(2))
     mask = np.array([True, False])
     for env, seed in ((seeded, 7), (other, None)):
         env.reset(seed=0)
@@ -173,7 +156,7 @@ def test_a_masked_reset_seeds_those_that_begin() -> None:
 
 
 def test_a_refused_reset_changes_nothing() -> None:
-    env, twin = (BatchEnv("Reach", 2, threads=1) for _ in range(2))
+    env, twin = (batch("Reach") for _ in range(2))
     for one in (env, twin):
         one.reset(seed=0, options={"difficulty": 0.5})
     for wrong in (

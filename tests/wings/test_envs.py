@@ -1,13 +1,12 @@
 """What every registered task owes to Gymnasium and to its users, whatever it is about."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from environments import NAMES, drawn, needed
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from numpy.testing import assert_allclose, assert_array_equal
@@ -18,19 +17,20 @@ from fastrod_envs.registration import task_class
 from fastrod_envs.rodtask import RodTask
 from fastrod_envs.vector import BatchEnv
 
-NAMES = fastrod_envs.names()
 KEYS = {"distance", "success", "contact", "lost", "position", "desired", "reward_terms"}
+SIZES = {"Catch": (20, 6), "TubeInsert": (28, 5)}
+"""Numbers of the state and of the goal."""
 
 
-def needed(name: str) -> None:
-    """Skip where the task's host is not installed."""
-    if task_class(name).hosted:
-        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
+@pytest.fixture
+def single(opened):
+    """Makes one environment on one thread."""
 
+    def make(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
+        needed(name)
+        return opened(gymnasium.make(f"fastrod/{name}-v0", threads=1, **options))
 
-def single(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
-    needed(name)
-    return gymnasium.make(f"fastrod/{name}-v0", threads=1, **options)
+    return make
 
 
 def several(name: str, n: int, **options: Any) -> BatchEnv:
@@ -48,11 +48,6 @@ def batch(request: pytest.FixtureRequest) -> Iterator[BatchEnv]:
     env.close()
 
 
-def drawn(env: BatchEnv, seed: int, n: int) -> np.ndarray:
-    """(n, num_envs, n_actions) actions from -1 to 1."""
-    return np.random.default_rng(seed).uniform(-1.0, 1.0, (n, *env.action_space.shape))
-
-
 def test_names_are_ids() -> None:
     assert fastrod_envs.ids() == tuple(f"fastrod/{name}-v0" for name in NAMES)
     assert all(id_ in gymnasium.registry for id_ in fastrod_envs.ids())
@@ -62,27 +57,19 @@ def test_names_are_ids() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gymnasiums_checker_has_nothing_to_say(name: str) -> None:
+def test_gymnasiums_checker_has_nothing_to_say(name, single):
     env = single(name)
     check_env(env.unwrapped, skip_render_check=True)  # render has tests of its own: it would open pages
-    assert env.action_space.shape == (task_length(env),)
-    env.close()
-
-
-def task_length(env: gymnasium.Env[Any, Any]) -> int:
-    return int(env.unwrapped.task.n_actions)
+    assert env.action_space.shape == (env.unwrapped.task.n_actions,)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_stable_baselines_checker_has_nothing_to_say(name: str) -> None:
-    checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker",
-        reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'",
-    )
+def test_stable_baselines_checker_has_nothing_to_say(name, single):
+    why = "stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=why)
     env = single(name)
     checker.check_env(env.unwrapped, warn=True)
-    assert (env.unwrapped.task.actions[0].unit or "") == env.unwrapped.task.actions[0].unit
-    env.close()
+    assert isinstance(env.unwrapped.task.actions[0].unit, str)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -115,7 +102,7 @@ def test_a_step_brings_new_arrays_within_the_spaces(batch: BatchEnv) -> None:
     observation, info = batch.reset(seed=3)
     assert info == {}
     kept: list[tuple[dict[str, Any], dict[str, Any]]] = []
-    for action in drawn(batch, 0, 5):
+    for action in drawn(batch, 5, seed=0):
         before = observation.copy()
         stepped = batch.step(action)
         assert_array_equal(observation, before)
@@ -133,16 +120,14 @@ def test_a_step_brings_new_arrays_within_the_spaces(batch: BatchEnv) -> None:
         assert info["position"].shape == info["desired"].shape == (3, 3)
         assert np.isfinite(reward).all()
         assert (info["distance"] >= 0.0).all()
-        terms = info["reward_terms"]
-        assert_allclose(
-            sum(terms[key] for key in terms if not key.startswith("_")), reward, rtol=1e-12, atol=1e-12
-        )
+        terms = [term for key, term in info["reward_terms"].items() if not key.startswith("_")]
+        assert_allclose(sum(terms), reward, rtol=1e-12, atol=1e-12)
 
 
 def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
     batch.reset(seed=5)
     total, steps, ends = np.zeros(3), np.zeros(3, int), np.zeros(3, int)
-    for action in drawn(batch, 1, 7):
+    for action in drawn(batch, 7, seed=1):
         observation, reward, terminated, truncated, info = batch.step(action)
         ended = terminated | truncated
         total, steps = total + reward, steps + 1
@@ -150,11 +135,11 @@ def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
         assert ("final_obs" in info) == ended.any()
         if ended.any():
             assert_array_equal(info["_final_obs"], ended)
-            told = info["final_info"]
-            assert_array_equal(told["_episode"], ended)
-            assert_allclose(told["episode"]["r"][ended], total[ended], rtol=1e-12)
-            assert_array_equal(told["episode"]["l"][ended], steps[ended])
-            assert_array_equal(told["distance"], info["distance"])
+            reported = info["final_info"]
+            assert_array_equal(reported["_episode"], ended)
+            assert_allclose(reported["episode"]["r"][ended], total[ended], rtol=1e-12)
+            assert_array_equal(reported["episode"]["l"][ended], steps[ended])
+            assert_array_equal(reported["distance"], info["distance"])
             for i, last in enumerate(info["final_obs"]):
                 assert (last is not None) == ended[i]
                 assert last is None or batch.single_observation_space.contains(last)
@@ -165,11 +150,11 @@ def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
     assert (ends >= 2).all()
 
 
-def test_one_environment_counts_alike() -> None:
-    env, vector = single("Reach", n_steps=3), several("Reach", 1, n_steps=3)
+def test_one_environment_counts_alike(single, opened):
+    env, vector = single("Reach", n_steps=3), opened(several("Reach", 1, n_steps=3))
     first, _ = env.reset(seed=9)
     assert_array_equal(vector.reset(seed=9)[0][0], first)
-    for k, action in enumerate(drawn(vector, 2, 3)):
+    for k, action in enumerate(drawn(vector, 3, seed=2)):
         observation, reward, terminated, truncated, info = env.step(action[0])
         batched = vector.step(action)
         assert reward == batched[1][0]
@@ -180,14 +165,12 @@ def test_one_environment_counts_alike() -> None:
     assert_array_equal(batched[4]["final_obs"][0], observation)
     with pytest.raises(InputError, match="reset"):
         env.step(action[0])
-    env.close()
-    vector.close()
 
 
 def test_only_masked_environments_begin_anew() -> None:
     env = several("Reach", 3)
     before, _ = env.reset(seed=1)
-    for action in drawn(env, 3, 4):
+    for action in drawn(env, 4, seed=3):
         before = env.step(action)[0]
     after, _ = env.reset(options={"reset_mask": np.array([False, True, False])})
     assert_array_equal(after[[0, 2]], before[[0, 2]])
@@ -199,7 +182,7 @@ def test_only_masked_environments_begin_anew() -> None:
 
 
 def test_what_is_not_finite_is_refused_and_nothing_happens(batch: BatchEnv) -> None:
-    actions = drawn(batch, 4, 2)
+    actions = drawn(batch, 2, seed=4)
     batch.reset(seed=7)
     expected = [batch.step(action)[:2] for action in actions]
     batch.reset(seed=7)
@@ -230,32 +213,60 @@ def test_actions_beyond_their_bounds_count_as_the_bounds() -> None:
     one, other = several("Reach", 2), several("Reach", 2)
     one.reset(seed=2)
     other.reset(seed=2)
-    far = np.where(drawn(one, 5, 1)[0] > 0.0, 7.0, -3.0)
+    far = np.where(drawn(one, 1, seed=5)[0] > 0.0, 7.0, -3.0)
     assert_array_equal(one.step(far)[0], other.step(np.clip(far, -1.0, 1.0))[0])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_step_before_a_reset(name: str) -> None:
-    env = several(name, 2)
+def test_no_step_before_a_reset(name, opened):
+    env = opened(several(name, 2))
     with pytest.raises(InputError, match=r"environment 0 .* reset"):
         env.step(np.zeros(env.action_space.shape))
-    env.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_breaks_under_random_actions(name: str) -> None:
-    env = several(name, 2)
+def test_nothing_breaks_under_random_actions(name, opened):
+    env = opened(several(name, 2))
     alone = isinstance(env.task, RodTask) and env.task.simulator.contact is None
     env.reset(seed=11)
     with np.errstate(divide="raise", over="raise", invalid="raise"):
         # at the largest rates: the roughest there is
-        for action in np.sign(drawn(env, 6, 400 if alone else 60)):
+        for action in np.sign(drawn(env, 400 if alone else 60, seed=6)):
             observation, reward, *_, info = env.step(action)
             assert np.isfinite(observation).all()
             assert np.isfinite(reward).all()
             assert np.isfinite(info["distance"]).all()
     assert not info["lost"].all()
-    env.close()
+
+
+BOUNDS = [
+    *(
+        ("Catch", 50, 45, o)
+        for o in ({}, {"action": "displacement"}, {"n_steps": 1}, {"observation": "goal"})
+    ),
+    *(("TubeInsert", 8, 25, options) for options in ({}, {"observation": "goal"}, {"n_steps": 3})),
+    *((name, 1, 150, {"action": a}) for name in ("Push", "QuadrupedPush") for a in ("rate", "displacement")),
+]
+
+
+@pytest.mark.parametrize(("name", "n", "steps", "options"), BOUNDS)
+def test_random_actions_stay_within_the_bounds(name, n, steps, options, opened):
+    env, goal = opened(several(name, n, **options)), "observation" in options
+    low, high = env.single_observation_space.low, env.single_observation_space.high
+    observation, _ = env.reset(seed=0)
+    if name in SIZES:
+        assert observation.shape == (n, SIZES[name][goal])
+    for action in drawn(env, steps, seed=2):
+        observation, reward, terminated, _, _ = env.step(action)
+        if name != "TubeInsert":
+            raw = env.task.goal() if goal else env.task.state()
+            assert (raw >= low - 1e-6).all()
+            assert (raw <= high + 1e-6).all()
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward).all()
+        assert env.observation_space.contains(observation)
+        if name not in SIZES:
+            assert not terminated[0]
 
 
 def test_huge_actions_are_finite() -> None:

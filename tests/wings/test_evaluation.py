@@ -1,13 +1,12 @@
 """Evaluation: whose episodes they are, what the figures mean, what is written."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip(
     "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
@@ -25,14 +24,14 @@ from fastrod_envs.single import SingleEnv
 
 def test_the_baseline_beats_those_that_do_not_look() -> None:
     result = evaluate("Reach", None, episodes=20, seed=5)
-    told = figures(result)
-    assert list(told) == ["baseline", "goal-blind", "random", "still"]
-    assert told["baseline"]["success"] == 1.0
-    assert told["baseline"]["distance_mean_m"] < 1e-3
-    assert min(told["baseline"]["correlation"]) > 0.99
+    reported = figures(result)
+    assert list(reported) == ["baseline", "goal-blind", "random", "still"]
+    assert reported["baseline"]["success"] == 1.0
+    assert reported["baseline"]["distance_mean_m"] < 1e-3
+    assert min(reported["baseline"]["correlation"]) > 0.99
     for blind in ("goal-blind", "random", "still"):
-        assert told[blind]["distance_mean_m"] > 0.05
-        assert told[blind]["success"] < 0.1
+        assert reported[blind]["distance_mean_m"] > 0.05
+        assert reported[blind]["success"] < 0.1
 
 
 def test_episode_k_is_that_of_its_seed() -> None:
@@ -47,7 +46,7 @@ def test_episode_k_is_that_of_its_seed() -> None:
         trial = result.trials["baseline"]
         assert trial.distance[k] == pytest.approx(info["distance"], abs=1e-9)
         assert trial.returned[k] == pytest.approx(returned, abs=1e-6)
-        np.testing.assert_allclose(trial.desired[k], info["desired"], atol=0.0)
+        assert_allclose(trial.desired[k], info["desired"], atol=0.0)
 
 
 def test_correlation_is_of_axes_on_which_goals_differ() -> None:

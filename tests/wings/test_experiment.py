@@ -65,7 +65,7 @@ class Noting:
             self.bench.prototype.stop()
 
 
-def wires(bend: Floats) -> Floats:
+def tendons(bend: Floats) -> Floats:
     """(n, 4) of bends (n, 2) [rad]."""
     return route(ROBOT).tendon_change(bend[:, None])
 
@@ -81,7 +81,7 @@ def short_run() -> Excitation:
         name="short",
         t=t,
         run=np.full(len(t), "run"),
-        dl=wires(0.3 * np.stack([np.sin(phase), np.sin(phase) ** 2], axis=1)),
+        dl=tendons(0.3 * np.stack([np.sin(phase), np.sin(phase) ** 2], axis=1)),
         tip_position=np.full((len(t), 3), np.nan),
         payload=payload,
         base_quaternion=base,
@@ -97,13 +97,13 @@ def circle_plan() -> InversePlan:
 
 
 def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path: Path) -> None:
-    hands, run, told = Noting(bench), short_run(), []
+    hands, run, reported = Noting(bench), short_run(), []
     log = excite(
         bench.prototype,
         run,
         hands,
         tmp_path / "run.csv",
-        progress=lambda what, done, total: told.append((what, done, total)),
+        progress=lambda what, done, total: reported.append((what, done, total)),
     )
     assert hands.asked == [("hang", MASS), ("turn", TILTED[1]), ("hang", 0.0), ("turn", 0.0)]
     first, second, third = np.diff(hands.at)
@@ -122,8 +122,8 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path:
     tilted = log.base_quaternion[:, 1] > 0.1
     assert (log.payload[tilted] == MASS).all()
     assert tilted.sum() == pytest.approx(SECONDS * 15.0, abs=3)
-    assert told[0][1] == 0
-    assert (np.diff([done for _, done, _ in told]) >= 0).all()
+    assert reported[0][1] == 0
+    assert (np.diff([done for _, done, _ in reported]) >= 0).all()
 
 
 def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ class Rig:
     def enabled(self) -> list[bool]:
         return [state == ENABLED for state in self.drives.states]
 
-    def mend(self) -> None:
+    def repair(self) -> None:
         self.drives.restore()
         self.emulator.frozen = self.emulator.hidden = False
         self.storm = 0
@@ -114,7 +114,7 @@ def moving(
         assert rig.drives.moving.all()
         yield rig
     finally:
-        rig.mend()
+        rig.repair()
         if rig.recorder.recording:
             rig.recorder.stop()
         rig.prototype.close()
@@ -214,7 +214,7 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
             rig.prototype.release()
             assert rig.stopped
             assert not any(rig.enabled)
-        rig.mend()
+        rig.repair()
         rig.go_on(0.6)
         assert rig.stopped  # no cause is there any more, and still it waits for a person
         assert not any(rig.enabled)
@@ -308,7 +308,7 @@ def _heard(bus: object, frames: int) -> None:
 CHILD = """
 import sys, time
 import numpy as np
-from fastrod_device.camera import Frame
+from fastrod_device.camera import CameraFrame
 from fastrod_device.drawing import Eye
 from fastrod_device.hardware import load_hardware
 from fastrod_device.prototype import Prototype
@@ -326,7 +326,7 @@ class Still:
             return None
         self.due, self.number = now + 1.0 / hardware.camera.rate, self.number + 1
         image = self.eye.draw(np.array([0.0, 0.0, 0.07]), np.array([1.0, 0.0, 0.0, 0.0]))
-        return Frame(image=image, t=now - 0.03, number=self.number)
+        return CameraFrame(image=image, t=now - 0.03, number=self.number)
     def close(self):
         pass
 with Prototype(hardware, sys.argv[1], Still()) as prototype:
@@ -350,8 +350,8 @@ def test_a_killed_process_leaves_its_drives_stopped_and_its_rows_on_disk(tmp_pat
     child = subprocess.Popen([sys.executable, "-c", CHILD, bus, str(log)], stdout=subprocess.PIPE, text=True)
     try:
         assert child.stdout is not None
-        told = list(itertools.takewhile(lambda line: int(line) < 8, child.stdout))
-        assert len(told) > 1
+        reported = list(itertools.takewhile(lambda line: int(line) < 8, child.stdout))
+        assert len(reported) > 1
         assert all(state == ENABLED for state in emulator.drives.states)
         child.send_signal(signal.SIGKILL)
         rest = [line for line in child.stdout if line.endswith("\n")]

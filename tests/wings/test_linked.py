@@ -1,16 +1,11 @@
 """What links offer beyond driving and reading is found and used; a link without it is driven all the same."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 from enum import Enum
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 import fastrod
 from fastrod.errors import InputError
@@ -25,14 +20,9 @@ from fastrod_viewer.teleop import Speeds, Teleop
 from fastrod_viewer.worlds import FreeWorld
 
 DT = 1.0 / 30.0
-
-
-class State(Enum):
-    """Of a guard."""
-
-    OFF = "off"
-    RUNNING = "running"
-    STOPPED = "stopped"
+ROBOT = fastrod.load_robot("prototype")
+AT_REST = np.array([-0.001, 0.0, 0.001, 0.0])
+State = Enum("State", {"OFF": "off", "RUNNING": "running", "STOPPED": "stopped"})  # of a guard
 
 
 class Watched:
@@ -40,70 +30,70 @@ class Watched:
 
     real = True
 
-    def __init__(self) -> None:
-        self.inner = SimulatedRobot(fastrod.load_robot("prototype"), real=True)
+    def __init__(self):
+        self.inner = SimulatedRobot(ROBOT, real=True)
         self.robot, self.read, self.close = self.inner.robot, self.inner.read, self.inner.close
-        self.supervisor = SimpleNamespace(
-            limits=SimpleNamespace(displacement=0.005, rate=0.004),
-            state=State.RUNNING,
-            status="It runs.",
-            first=None,
-            client_lost=lambda now: self.halt(f"nobody, at {now:g} s"),
-        )
+        limits = SimpleNamespace(displacement=0.005, rate=0.004)
+        client_lost = lambda now: self.halt(f"nobody, at {now:g} s")  # noqa: E731
+        self.supervisor = SimpleNamespace(limits=limits, client_lost=client_lost)
+        self.run()
         self.clock = SimpleNamespace(now=lambda: 7.0)
-        self.source: object | None = object()
-        self.sighting = SimpleNamespace(t=6.96, flag="")
+        self.source, self.sighting = object(), SimpleNamespace(t=6.96, flag="")
         self.readings = SimpleNamespace(dl=np.zeros(4), tension=np.array([1.0, 2.0, 3.0, 4.0]))
-        self.glides: list[tuple[np.ndarray, float]] = []
-        self.requested = 0
-        self.rows = 0
+        self.glides, self.requested, self.rows = [], 0, 0
 
-    @property
-    def commanded(self) -> np.ndarray:
-        return np.array(self.readings.dl)
-
-    def halt(self, why: str) -> None:
-        self.inner.stop()
-        self.supervisor.state, self.supervisor.first, self.supervisor.status = (
-            State.STOPPED,
-            why,
-            f"Stopped: {why}.",
-        )
-
-    def stop(self) -> None:
-        self.halt("a button")
-
-    def release(self) -> None:
-        self.requested += 1
-
-    def settle(self) -> None:
-        self.inner.release()
+    def run(self):
         self.supervisor.state, self.supervisor.first, self.supervisor.status = State.RUNNING, None, "It runs."
 
-    def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
+    @property
+    def commanded(self):
+        return np.array(self.readings.dl)
+
+    def halt(self, why):
+        self.inner.stop()
+        guard = self.supervisor
+        guard.state, guard.first, guard.status = State.STOPPED, why, f"Stopped: {why}."
+
+    def stop(self):
+        self.halt("a button")
+
+    def release(self):
+        self.requested += 1
+
+    def settle(self):
+        self.inner.release()
+        self.run()
+
+    def command(self, dl, ext=None):
         raise AssertionError("it glides")
 
-    def glide(self, dl: ArrayLike, seconds: float) -> None:
+    def glide(self, dl, seconds):
         self.glides.append((np.array(dl), seconds))
         self.inner.command(dl)
         if not self.inner.stopped:
             self.readings.dl = np.array(dl)
 
 
-def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
+def until(holds, seconds=30.0):
     end = time.monotonic() + seconds
     while not holds() and time.monotonic() < end:
         time.sleep(0.01)
     return holds()
 
 
-def driven(link: object) -> Session:
-    world = FreeWorld(fastrod.load_robot("prototype"))
-    return Session(world, Teleop(world, limits=Linked(link).limits), draw=lambda frame: None, link=link)
+def driven(link, start=False, record=None):
+    """A session that drives it; `start` runs it, `record` records to this path."""
+    world = FreeWorld(ROBOT)
+    session = Session(world, Teleop(world, limits=Linked(link).limits), draw=lambda frame: None, link=link)
+    if record is not None:
+        session.submit(lambda: session.record(record))
+    if start:
+        session.start()
+    return session
 
 
-def test_tendons_keep_to_the_rate_of_the_link_and_go_straight() -> None:
-    world = FreeWorld(fastrod.load_robot("prototype"))
+def test_tendons_keep_to_the_rate_of_the_link_and_go_straight():
+    world = FreeWorld(ROBOT)
     teleop = Teleop(world, Speeds(bend=20.0), limits=TendonLimits(rate=0.004))
     teleop.bend(0, 0.4, 0.2)
     teleop.change_tendon(0, -0.004)
@@ -116,8 +106,8 @@ def test_tendons_keep_to_the_rate_of_the_link_and_go_straight() -> None:
     np.testing.assert_allclose(held[-1] - held[0], teleop.change, atol=1e-15)
 
 
-def test_bends_and_controls_end_where_the_tendons_do() -> None:
-    world = FreeWorld(fastrod.load_robot("prototype"))
+def test_bends_and_controls_end_where_the_tendons_do():
+    world = FreeWorld(ROBOT)
     teleop = Teleop(world, limits=TendonLimits(displacement=0.005))
     teleop.bend(0, 9.0, -9.0)
     assert np.abs(teleop.change).max() < 0.005
@@ -128,47 +118,42 @@ def test_bends_and_controls_end_where_the_tendons_do() -> None:
 
 
 @pytest.mark.parametrize("name", ["displacement", "rate"])
-def test_a_limit_is_positive(name: str) -> None:
+def test_a_limit_is_positive(name):
     with pytest.raises(InputError, match=f"TendonLimits.{name} is 0.0; it must be positive"):
         TendonLimits(**{name: 0.0})
 
 
-def test_a_link_that_offers_nothing_is_driven_all_the_same() -> None:
-    link = SimulatedRobot(fastrod.load_robot("prototype"))
+def test_a_link_that_offers_nothing_is_driven_all_the_same():
+    link = SimulatedRobot(ROBOT)
     far = Linked(link)
     assert far.limits == TendonLimits()
-    assert far.ready
-    assert not far.stopped
-    assert (far.status, far.camera(), far.picture(), far.sees) == ("", "", None, False)
-    far.command(np.array([-0.001, 0.0, 0.001, 0.0]), np.zeros(1), DT)
-    np.testing.assert_array_equal(far.held()[0], [-0.001, 0.0, 0.001, 0.0])
-    np.testing.assert_array_equal(far.standing()[0], far.held()[0])
+    assert (far.ready, far.stopped, far.status) == (True, False, "")
+    assert (far.camera(), far.picture(), far.sees) == ("", None, False)
+    far.command(AT_REST, np.zeros(1), DT)
+    np.testing.assert_array_equal([far.held()[0], far.standing()[0]], [AT_REST, AT_REST])
 
 
-def test_a_link_that_glides_knows_for_how_long() -> None:
+def test_a_link_that_glides_knows_for_how_long():
     link = Watched()
-    session = driven(link)
-    session.start()
+    session = driven(link, start=True)
     session.teleop.bend(0, 0.3, 0.0)
     session.wake()
     assert until(lambda: session.teleop.arrived and len(link.glides) > 20)
     session.close()
-    held = np.array([dl for dl, _ in link.glides])
-    seconds = np.array([s for _, s in link.glides])
+    held, seconds = (np.array(values) for values in zip(*link.glides, strict=True))
     assert (np.abs(np.diff(held, axis=0)).max(axis=1) <= 0.004 * seconds[1:] + 1e-12).all()
     assert held[-1][0] == pytest.approx(-0.3 * 0.0075)
 
 
-def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None:
+def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready():
     link = Watched()
-    session = driven(link)
-    session.start()
+    session = driven(link, start=True)
     session.teleop.bend(0, 0.5, 0.0)
     session.wake()
     assert until(lambda: link.readings.dl[0] < -3e-4)
     link.halt("a tendon broke")
     assert until(lambda: session.stopped)
-    link.readings.dl = np.array([-0.001, 0.0, 0.001, 0.0])  # where it came to rest
+    link.readings.dl = AT_REST.copy()  # where it came to rest
     n = len(link.glides)
     session.teleop.bend(0, 0.6, 0.0)
     # the model stands as the encoders say
@@ -177,17 +162,15 @@ def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None
     session.release()
     assert link.requested == 1
     time.sleep(0.2)
-    assert session.stopped
-    assert session.releasing
-    assert len(link.glides) == n
+    assert (session.stopped, session.releasing, len(link.glides)) == (True, True, n)
     link.settle()
     assert until(lambda: not session.stopped)
     assert until(lambda: len(link.glides) > n)
-    np.testing.assert_allclose(link.glides[n][0], [-0.001, 0.0, 0.001, 0.0], atol=1e-9)
+    np.testing.assert_allclose(link.glides[n][0], AT_REST, atol=1e-9)
     session.close()
 
 
-def test_a_real_robot_is_not_released_within_a_second_of_a_stop() -> None:
+def test_a_real_robot_is_not_released_within_a_second_of_a_stop():
     link = Watched()
     session = driven(link)
     session.release()
@@ -210,36 +193,31 @@ def test_a_real_robot_is_not_released_within_a_second_of_a_stop() -> None:
     session.close()
 
 
-def test_a_simulated_robot_is_released_at_once() -> None:
-    link = SimulatedRobot(fastrod.load_robot("prototype"))
-    session = driven(link)
-    session.start()
+def test_a_simulated_robot_is_released_at_once():
+    link = SimulatedRobot(ROBOT)
+    session = driven(link, start=True)
     session.stop()
     session.stop()
-    assert session.stopped
-    assert link.stopped
+    assert (session.stopped, link.stopped) == (True, True)
     session.release()
     assert until(lambda: not session.stopped)
     assert not link.stopped
     session.close()
 
 
-def test_when_nobody_watches_the_guard_hears_so() -> None:
+def test_when_nobody_watches_the_guard_hears_so():
     link = Watched()
     session = driven(link)
     session.nobody()
-    assert link.supervisor.first == "nobody, at 7 s"
-    assert session.stopped
+    assert (link.supervisor.first, session.stopped) == ("nobody, at 7 s", True)
     session.close()
 
 
-def test_figures_of_a_link() -> None:
+def test_figures_of_a_link():
     link = Watched()
     far, now = Linked(link), link.read()
-    assert far_rows(far, now) == [
-        ("Tendons pull", "1.00 · 2.00 · 3.00 · 4.00 N"),
-        ("Camera", "marker seen 40 ms ago"),
-    ]
+    rows = [("Tendons pull", "1.00 · 2.00 · 3.00 · 4.00 N"), ("Camera", "marker seen 40 ms ago")]
+    assert far_rows(far, now) == rows
     link.sighting = SimpleNamespace(t=6.99, flag="no marker")
     assert far.camera() == "no marker, last trusted 0.0 s ago"
     link.sighting = SimpleNamespace(t=5.0, flag="")
@@ -248,9 +226,9 @@ def test_figures_of_a_link() -> None:
     assert Linked(link).camera() == ""
 
 
-def test_a_recording_of_a_link_begins_by_its_clock(tmp_path: Path) -> None:
+def test_a_recording_of_a_link_begins_by_its_clock(tmp_path):
     """The world's time runs from another zero: a log that began by it would lack its first seconds."""
-    link = SimulatedRobot(fastrod.load_robot("prototype"))
+    link = SimulatedRobot(ROBOT)
     world = FreeWorld(link.robot)
     for _ in range(60):
         world.play()
@@ -264,25 +242,22 @@ def test_a_recording_of_a_link_begins_by_its_clock(tmp_path: Path) -> None:
     assert len(log) > 5
 
 
-def test_a_link_that_records_fills_the_log_by_itself(tmp_path: Path) -> None:
+def test_a_link_that_records_fills_the_log_by_itself(tmp_path):
     class Own(Watched):
         """It records, too."""
 
         elapsed = 100.0
-        to: Recorder | None = None
+        to = None
 
-        def recorder_for(self, path: str) -> Recorder:
+        def recorder_for(self, path):
             return Recorder(self.robot, path, extra=("current_1",))
 
-        def record(self, recorder: Recorder | None) -> None:
+        def record(self, recorder):
             self.to = recorder
 
     link = Own()
-    session = driven(link)
-    session.submit(lambda: session.record(tmp_path / "a.csv"))
-    session.start()
+    session = driven(link, start=True, record=tmp_path / "a.csv")
     assert until(lambda: link.to is not None)
-    assert link.to is not None
     time.sleep(0.2)
     assert len(link.to) == 0  # the session adds none of its own
     for k in range(3):
@@ -295,7 +270,6 @@ def test_a_link_that_records_fills_the_log_by_itself(tmp_path: Path) -> None:
     assert set(log.extra) >= {"current_1"}
 
 
-def test_pictures_are_as_wide_as_their_window() -> None:
-    assert fitted(np.zeros((480, 640, 3), np.uint8)).shape == (240, 320, 3)
-    assert fitted(np.zeros((24, 32, 3), np.uint8)).shape == (240, 320, 3)
-    assert fitted(np.zeros((1080, 1920, 3), np.uint8)).shape == (180, 320, 3)
+def test_pictures_are_as_wide_as_their_window():
+    for size, height in (((480, 640), 240), ((24, 32), 240), ((1080, 1920), 180)):
+        assert fitted(np.zeros((*size, 3), np.uint8)).shape == (height, 320, 3)

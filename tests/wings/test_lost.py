@@ -1,13 +1,11 @@
 """No episode ends as lost while `settle` can solve the robot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
+from environments import NAMES, needed
 
 import bench_lost
-import fastrod_envs
 from fastrod_envs.policies import Policy, find
 from fastrod_envs.registration import task_class
 from fastrod_envs.single import SingleEnv
@@ -38,11 +36,10 @@ def test_an_episode_of_the_shipped_policy_is_not_lost(task: str, seed: int, rand
     env.close()
 
 
-@pytest.mark.parametrize("task", fastrod_envs.names())
+@pytest.mark.parametrize("task", NAMES)
 def test_random_steps_lose_no_robot_that_settles(task: str) -> None:
+    needed(task)
     hosted = task_class(task).hosted
-    if hosted:
-        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
     options: dict[str, Any] = {} if hosted else {"randomise": bench_lost.HEAVY}
     count = bench_lost.drive(task, 8 if hosted else 160, seed=3, **options)
     assert count.steps >= (8 if hosted else 160)

@@ -1,8 +1,6 @@
 """Adapters of the measured sets: units, frames, order, on a few rows in the published form; and on the sets
 where they are there."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path
@@ -23,16 +21,11 @@ needs_data = pytest.mark.skipif(
     not (DATA / "asl_trunk.csv").is_file(), reason="no measured sets here; FASTROD_DATA names their folder"
 )
 
-ASL_HEADER = (
-    "run,payload_g,row,t_s,"
-    + ",".join(f"u{k}_deg" for k in range(1, 7))
-    + ","
-    + ",".join(f"phi{k}_deg" for k in range(1, 7))
-    + ","
-    + ",".join(f"{axis}{k}_mm" for k in (1, 2, 3) for axis in "xyz")
-)
-ETHZ_HEADER = "run,tip_load_N,t_s," + ",".join(
-    f"{m}{k}_{axis}_mm" for m in ("tip", "base") for k in (1, 2, 3) for axis in "xyz"
+MARKERS = [f"{k}{axis}" for k in (1, 2, 3) for axis in "xyz"]
+ANGLES = [f"{name}{k}_deg" for name in ("u", "phi") for k in range(1, 7)]
+ASL_HEADER = ",".join(["run,payload_g,row,t_s", *ANGLES, *(f"{m[1]}{m[0]}_mm" for m in MARKERS)])
+ETHZ_HEADER = ",".join(
+    ["run,tip_load_N,t_s", *(f"{end}{m[0]}_{m[1]}_mm" for end in ("tip", "base") for m in MARKERS)]
 )
 ARMLAB = """row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump
 0,0,0,0.1,-43,-144,276,0,0
@@ -40,6 +33,12 @@ ARMLAB = """row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump
 7,0,8,0,-36,-114,334,0,0
 8,0,8.1,0,500,500,500,1,0
 """
+
+
+def armlab_file(tmp_path: Path, text: str = ARMLAB) -> Path:
+    path = tmp_path / "tdcr.csv"
+    path.write_text(text)
+    return path
 
 
 def asl_file(tmp_path: Path) -> Path:
@@ -95,13 +94,10 @@ def test_ethz_beam_starts_straight_and_drops_along_gravity(tmp_path: Path) -> No
 
 
 def test_armlab_tdcr_rest_tip_is_straight_and_glitches_are_missing(tmp_path: Path) -> None:
-    path = tmp_path / "tdcr.csv"
-    path.write_text(ARMLAB)
-    log, robot = armlab_tdcr(path)
-    assert_allclose(log.tip_position[:2].mean(axis=0), [0.0, 0.0, measured.ARMLAB_LENGTH], atol=1e-12)
-    assert_allclose(
-        log.tip_position[2] - (0.0, 0.0, measured.ARMLAB_LENGTH), [0.007, 0.057, -0.030], atol=1e-12
-    )
+    log, robot = armlab_tdcr(armlab_file(tmp_path))
+    straight = (0.0, 0.0, measured.ARMLAB_LENGTH)
+    assert_allclose(log.tip_position[:2].mean(axis=0), straight, atol=1e-12)
+    assert_allclose(log.tip_position[2] - straight, [0.007, 0.057, -0.030], atol=1e-12)
     assert_array_equal(log.measured, [True, True, True, False])
     assert_allclose(log.dl[2], [0.0, -0.008, 0.0])
     # 2.5 mm each: 8 mm of tendon 2 is in the fourth
@@ -111,24 +107,16 @@ def test_armlab_tdcr_rest_tip_is_straight_and_glitches_are_missing(tmp_path: Pat
 
 
 def test_a_pull_at_the_edge_of_the_cube_is_in_the_last_cell(tmp_path: Path) -> None:
-    path = tmp_path / "tdcr.csv"
-    path.write_text(ARMLAB.replace("8,0,8.1,0", "8,2.5,25,30"))
-    log, _ = armlab_tdcr(path)
+    log, _ = armlab_tdcr(armlab_file(tmp_path, ARMLAB.replace("8,0,8.1,0", "8,2.5,25,30")))
     assert log.run[-1] == "cell_199"
 
 
 def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
-    """Free are the numbers that nobody publishes: identification may move them, and the frame, but not what
-    is published."""
-    (tmp_path / "tdcr.csv").write_text(ARMLAB)
-    (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")
+    """Identification may move the numbers that nobody publishes, and the frame, but not what is published."""
+    (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(armlab_file(tmp_path))
     free = {robot.name: [u.name for u in base_model(robot).unknowns] for robot in (trunk, tdcr)}
-    sides = [f"tendon.{k}." for k in range(1, 7)]
-    assert set(free["asl_trunk"]) >= {
-        *(f"{side}gain" for side in sides),
-        *(f"{side}zero" for side in sides),
-        "segment.3.length",
-    }
+    tendons = {f"tendon.{k}.{what}" for k in range(1, 7) for what in ("gain", "zero")}
+    assert set(free["asl_trunk"]) >= tendons | {"segment.3.length"}
     assert {"segment.1.length", "tendon.*.offset"} <= set(free["armlab_tdcr"])
     for robot in (trunk, tdcr):
         assert robot.sensor["registration_sd"] == (0.01, 0.05)
@@ -137,8 +125,7 @@ def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
 
 
 def test_base_frames_hang_right_handed(tmp_path: Path) -> None:
-    (tmp_path / "tdcr.csv").write_text(ARMLAB)
-    for _, robot in (asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")):
+    for _, robot in (asl_trunk(asl_file(tmp_path)), armlab_tdcr(armlab_file(tmp_path))):
         w, x, y, z = robot.base_quaternion
         # d3 of the base in the world
         down = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -147,11 +134,10 @@ def test_base_frames_hang_right_handed(tmp_path: Path) -> None:
 
 
 def test_detect_knows_the_raw_files_by_their_header(tmp_path: Path) -> None:
-    (tmp_path / "tdcr.csv").write_text(ARMLAB)
     (tmp_path / "beam.csv").write_text(ETHZ_HEADER)
     (tmp_path / "log.csv").write_text("t,dl_1,tip_x,tip_y,tip_z\n")
     assert detect(asl_file(tmp_path)) is asl_trunk
-    assert detect(tmp_path / "tdcr.csv") is armlab_tdcr
+    assert detect(armlab_file(tmp_path)) is armlab_tdcr
     assert detect(tmp_path / "beam.csv") is ethz_beam
     assert detect(tmp_path / "log.csv") is None
     assert detect(tmp_path / "absent.csv") is None
@@ -159,9 +145,8 @@ def test_detect_knows_the_raw_files_by_their_header(tmp_path: Path) -> None:
 
 def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> None:
     path = asl_file(tmp_path)
-    with pytest.raises(
-        LogError, match=r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"
-    ):
+    sentence = r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"
+    with pytest.raises(LogError, match=sentence):
         armlab_tdcr(path)
     with pytest.raises(UnknownNameError, match="no run 'frist' in log 'trunk'; did you mean 'first'"):
         asl_trunk(path, run="frist")
@@ -185,13 +170,9 @@ def test_measured_set_is_a_valid_run_log(name: str, tmp_path: Path) -> None:
 @needs_data
 def test_ethz_beam_drops_as_published() -> None:
     log, _ = ethz_beam(DATA / "ethz_beam.csv")
-    drop = {
-        run: -1e3 * float(log.only(run).tip_position[log.only(run).measured, 0].mean()) for run in log.runs
-    }
-    assert drop["gravity_a"] == pytest.approx(6.5, abs=0.1)
-    assert drop["gravity_b"] == pytest.approx(6.5, abs=0.1)
-    assert drop["load52_a"] == pytest.approx(16.95, abs=0.1)
-    assert drop["load52_b"] == pytest.approx(16.95, abs=0.1)
+    for run, drop in {"gravity_a": 6.5, "gravity_b": 6.5, "load52_a": 16.95, "load52_b": 16.95}.items():
+        rows = log.measured & (log.run == run)
+        assert -1e3 * log.tip_position[rows, 0].mean() == pytest.approx(drop, abs=0.1)
 
 
 @needs_data
@@ -213,10 +194,10 @@ def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
     order = [motor for pair in measured.ASL_MOTORS for motor in pair]
-    told = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
+    reported = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
     felt = np.stack([log.extra[f"phi{motor}_deg"] for motor in order], axis=1)
-    assert np.sqrt(np.mean((felt - told) ** 2)) == pytest.approx(11.5, abs=0.1)
-    late = [np.sqrt(np.mean((felt[k:] - told[: len(told) - k]) ** 2)) for k in range(12)]
+    assert np.sqrt(np.mean((felt - reported) ** 2)) == pytest.approx(11.5, abs=0.1)
+    late = [np.sqrt(np.mean((felt[k:] - reported[: len(reported) - k]) ** 2)) for k in range(12)]
     assert int(np.argmin(late)) > 0
 
 

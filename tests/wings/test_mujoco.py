@@ -1,22 +1,21 @@
 """A MuJoCo body carries a rod: what its joints feel, whose forces are whose, what the capsules meet."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 
 import mujoco
 import numpy as np
 import pytest
-from bullets import soft_robot
+from bullets import clearance_of, soft_robot
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusals
+from scipy.spatial.transform import Rotation
 
 import fastrod.hosts
-from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import com_motion, refresh
 from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
-from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
 
@@ -71,7 +70,7 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     expected = np.concatenate([by_point, by_angle]).T @ rod.wrench
     assert np.abs(data.qvel - start).max() > 0.0
     assert np.abs(expected).max() > 0.1
-    np.testing.assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
+    assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_motion_of_the_base_is_the_derivative_of_its_pose():
@@ -83,20 +82,9 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose():
         return link.motion().pose
 
     after, before, now = pose(h), pose(-h), (pose(0.0), link.motion())[1]
-    np.testing.assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
-    rotation = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
-    spin = (
-        0.5
-        * np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        / (2 * h)
-    )
-    np.testing.assert_allclose(spin, now.velocity[3:], atol=1e-8)
+    assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
+    end, start = (Rotation.from_quat(np.roll(pose[3:], -1)) for pose in (after, before))
+    assert_allclose((end * start.inv()).as_rotvec() / (2 * h), now.velocity[3:], atol=1e-8)
 
 
 def test_motion_is_that_of_the_joints_now_and_not_of_the_last_steps_start():
@@ -106,7 +94,7 @@ def test_motion_is_that_of_the_joints_now_and_not_of_the_last_steps_start():
     data.qvel[0] = 2.0
     mujoco.mj_step(model, data)
     assert data.xpos[1, 0] == 0.0
-    np.testing.assert_allclose(MujocoBody(model, data, "cart").motion().pose[:3], [0.01, 0.0, 0.0])
+    assert_allclose(MujocoBody(model, data, "cart").motion().pose[:3], [0.01, 0.0, 0.0])
 
 
 def test_forces_of_others_stay_and_the_rods_own_go():
@@ -120,20 +108,18 @@ def test_forces_of_others_stay_and_the_rods_own_go():
     others = np.array([0.3, -0.2, 0.1, 0.01, 0.02, -0.03])
     data.xfrc_applied[cart] = others
     rods = [MujocoRod(robot, model, data, "cart", name=name) for name in ("left", "right")]
-    before = data.qvel[:3].copy()
+    before, both = data.qvel[:3].copy(), others[:3] + np.array([1.0, 2.0, 0.0])
     for rod, force in zip(rods, ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0)), strict=True):
         rod.begin(tip_force=force)
-    np.testing.assert_allclose(data.xfrc_applied[cart, :3], others[:3] + np.array([1.0, 2.0, 0.0]), atol=1e-7)
+    assert_allclose(data.xfrc_applied[cart, :3], both, atol=1e-7)
     mujoco.mj_step(model, data)
     for rod in rods:
         rod.end()
-    np.testing.assert_allclose(
-        data.qvel[:3] - before, 0.005 * (others[:3] + np.array([1.0, 2.0, 0.0])), atol=1e-9
-    )
-    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    assert_allclose(data.qvel[:3] - before, 0.005 * both, atol=1e-9)
+    assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].step()
     rods[0].step()
-    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].begin()
     data.xfrc_applied[:] = 0.0  # somebody clears everything
     rods[0].end()
@@ -142,9 +128,7 @@ def test_forces_of_others_stay_and_the_rods_own_go():
 
 def test_every_geom_is_an_obstacle_where_it_is():
     hull = np.random.default_rng(8).normal(size=(40, 3)) * 0.03
-    spec = spec_of(
-        '<body name="probe" mocap="true" pos="0.15 0.1 0.12"><geom name="probe" size="0.001"/></body>'
-    )
+    spec = spec_of('<body name="probe" mocap="true"><geom name="probe" size="0.001"/></body>')
     spec.add_mesh(name="hull", uservert=hull.ravel())
     kinds = mujoco.mjtGeom
     shapes = {
@@ -168,30 +152,18 @@ def test_every_geom_is_an_obstacle_where_it_is():
     data = mujoco.MjData(model)
     refresh(model, data)
     for name in shapes:
-        contact = MujocoBodyContact(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
+        body, geoms = model.body(name).id, (model.geom("probe").id, model.geom(name).id)
+        contact = MujocoBodyContact(model, data, body, dt=0.005, relaxation=0.1, friction=0.3)
         assert [shape.obstacle.shape for shape in contact.shapes] == [name]
-        pose = contact.expected([])[0][name]
-        robot = soft_robot(1)
-        sim = Simulator(
-            robot,
-            contact=ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0),
-        )
-        # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
-        state = sim.settle(
-            robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={name: pose}
-        )
+        clearance, points = clearance_of(contact)
         ends = []
-        for point in state.position[0, [0, -1]]:
+        for point in points:
             data.mocap_pos[0] = point
             refresh(model, data)
-            ends.append(
-                mujoco.mj_geomDistance(model, data, model.geom("probe").id, model.geom(name).id, 1.0, None)
-            )
+            ends.append(mujoco.mj_geomDistance(model, data, *geoms, 1.0, None))
         assert min(ends) > 0.0
-        assert 0.0 < sim.clearance()[0] <= min(ends) + 1e-5
-        np.testing.assert_allclose(
-            contact.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3]
-        )
+        assert 0.0 < clearance <= min(ends) + 1e-5
+        assert_allclose(contact.com().pose[:3], com_motion(model, data, body).pose[:3])
 
 
 def stand(ball=BALL, **options):
@@ -211,10 +183,10 @@ def test_contacts_of_the_capsules_are_read_back():
     felt = rod.felt
     assert set(felt.body) == {model.body("ball").id}
     # the ball rests, so the rod bears what presses it; at the height of its middle, on the rod's surface
-    np.testing.assert_allclose(felt.force.sum(0), [-0.05, 0.0, 0.0], atol=1e-4)
-    np.testing.assert_allclose(rod.contact_force.sum(0), felt.force.sum(0))
-    np.testing.assert_allclose(felt.arclength, 0.15, atol=2e-3)
-    np.testing.assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
+    assert_allclose(felt.force.sum(0), [-0.05, 0.0, 0.0], atol=1e-4)
+    assert_allclose(rod.contact_force.sum(0), felt.force.sum(0))
+    assert_allclose(felt.arclength, 0.15, atol=2e-3)
+    assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
     assert (np.abs(rod.wrench) < 1e-9).all()  # the rod itself knows nothing of it
 
 
@@ -232,11 +204,8 @@ def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
     assert np.abs(data.qvel).max() < 1e-3
     given = rod.step(line_force=(0.1, 0.0, 0.0))
     assert given.ok[0]
-    with pytest.raises(
-        InputError,
-        match=r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or "
-        r"\(2, 11, 3\) \[N/m\]\.$",
-    ):
+    sentence = r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"
+    with pytest.raises(InputError, match=sentence):
         rod.step(line_force=np.zeros((2, 3, 3)))
     rod.reset()
     rod.step(line_force=(0.0, 0.0, 0.0))
@@ -258,9 +227,9 @@ def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own
         patch.setattr(rod.simulator, "_state", lost)
         patch.setattr(rod.simulator, "_warm", np.array([False]))
         rod.step()
-    np.testing.assert_array_equal(rod._feedback.force, force)
+    assert_array_equal(rod._feedback.force, force)
     assert not data.xfrc_applied[post].any()
-    np.testing.assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
+    assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
     assert rod.step().ok[0]
 
 
@@ -269,18 +238,15 @@ def test_line_force_of_a_call_that_is_refused_is_not_kept():
     given = np.array([0.1, 0.0, 0.0])
     rod.step(line_force=given)
     given[:] = 9.0  # the caller's own array
-    for bad, sentence in (
-        ({"line_force": (np.nan, 0, 0)}, "^line_force holds a value that is not finite"),
-        (
-            {"line_force": ("a", "b", "c")},
-            r"^line_force is not an array of numbers; with feel=True give "
-            r"\(3,\) or \(2, 11, 3\) \[N/m\]\.$",
-        ),
-        (
-            {"line_force": (5.0, 0.0, 0.0), "tip_force": (np.nan, 0.0, 0.0)},
-            "^tip_force holds a value that is not finite",
-        ),
-    ):
+    give = r"^line_force is not an array of numbers; with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"
+    for sentence, bad in {
+        "^line_force holds a value that is not finite": {"line_force": (np.nan, 0, 0)},
+        give: {"line_force": ("a", "b", "c")},
+        "^tip_force holds a value that is not finite": {
+            "line_force": (5.0, 0.0, 0.0),
+            "tip_force": (np.nan, 0.0, 0.0),
+        },
+    }.items():
         for call in (rod.step, rod.settle):
             with pytest.raises(InputError, match=sentence):
                 call(**bad)
@@ -294,9 +260,8 @@ def test_capsules_of_another_robot_are_refused():
     spec, robot = spec_of(POST), soft_robot(1)
     add_capsules(spec, robot, "post")
     model = spec.compile()
-    longer = dataclasses.replace(
-        robot, segments=tuple(dataclasses.replace(s, length=1.5 * s.length) for s in robot.segments)
-    )
+    segments = tuple(dataclasses.replace(s, length=1.5 * s.length) for s in robot.segments)
+    longer = dataclasses.replace(robot, segments=segments)
     sentence = (
         r"^capsule 0 of 'rod' has radius 0.012 m and half length 0.005 m, where this robot has 0.012 "
         r"m and 0.0075 m; they were added"
@@ -321,7 +286,7 @@ def test_rod_stands_on_the_world_too():
     add_capsules(spec, robot, "world")
     model = spec.compile()
     rod = MujocoRod(robot, model, mujoco.MjData(model), 0, position=(0.1, 0.2, 0.3))
-    np.testing.assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
+    assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
     assert rod.wrench[2] == pytest.approx(-0.5 * 0.2 * 9.81)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
     rod.step()
@@ -336,137 +301,133 @@ def test_servos_hold_the_arm_where_it_is_commanded():
     arm.place(q)
     for _ in range(50):
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
+    assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
     assert np.abs(arm.torque()).max() < 1e-4
     with pytest.raises(
-        InputError,
-        match=r"^q is \[0, 0\]; give 6 finite numbers, one for each of "
-        rf"{JOINTS[0]}",
+        InputError, match=rf"^q is \[0, 0\]; give 6 finite numbers, one for each of {JOINTS[0]}"
     ):
         arm.drive([0, 0])
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "sentence"),
-    [
-        (
-            {"robot": "prototype"},
-            RobotError,
-            r"^robot is 'prototype'; give one Robot, for example "
-            r"fastrod.load_robot\('prototype'\)\.$",
-        ),
-        (
-            {"capsules_per_segment": "a"},
-            InputError,
-            r"^'a' capsules a segment; give at least one, a whole "
-            r"number\.$",
-        ),
-        ({"capsules_per_segment": 2.5}, InputError, r"^2.5 capsules a segment; give at least one"),
-        ({"capsules_per_segment": True}, InputError, r"^True capsules a segment; give at least one"),
-        (
-            {"color": (1, 2)},
-            InputError,
-            r"^color is \(1, 2\); give red, green, blue and opacity, four "
-            r"numbers from 0 to 1\.$",
-        ),
-        ({"head_color": "red"}, InputError, r"^head_color is 'red'; give red, green, blue and opacity"),
-        ({"friction": np.nan}, InputError, r"^friction is nan; it must be a number, zero or positive\.$"),
-        ({"friction": -1}, InputError, r"^friction is -1; it must be a number, zero or positive\.$"),
-        (
-            {"contact_bodies": "ball"},
-            HostError,
-            r"^contact_bodies is 'ball'; give a list of bodies, as contact_bodies=\['ball'\]\.$",
-        ),
-    ],
-)
-def test_capsules_that_no_model_can_have_are_a_sentence(options, error, sentence):
+def capsules(**options):
+    return lambda spec: add_capsules(**{"spec": spec, "robot": soft_robot(1), "host": "post"} | options)
+
+
+CAPSULE_INPUT = {
+    r"^'a' capsules a segment; give at least one, a whole number\.$": capsules(capsules_per_segment="a"),
+    r"^0 capsules a segment; give at least one, a whole number\.$": capsules(capsules_per_segment=0),
+    r"^2.5 capsules a segment; give at least one": capsules(capsules_per_segment=2.5),
+    r"^True capsules a segment; give at least one": capsules(capsules_per_segment=True),
+    r"^color is \(1, 2\); give red, green, blue and opacity, four numbers from 0 to 1\.$": capsules(
+        color=(1, 2)
+    ),
+    r"^head_color is 'red'; give red, green, blue and opacity": capsules(head_color="red"),
+    r"^friction is nan; it must be a number, zero or positive\.$": capsules(friction=np.nan),
+    r"^friction is -1; it must be a number, zero or positive\.$": capsules(friction=-1),
+}
+CAPSULE_HOSTS = {
+    r"^contact_bodies is 'ball'; give a list of bodies, as contact_bodies=\['ball'\]\.$": capsules(
+        contact_bodies="ball"
+    ),
+    r"^spec is a str; give a mujoco.MjSpec": capsules(spec="arm.xml"),
+    r"^the spec has no body 'pst'; did you mean 'post'\?": capsules(host="pst"),
+}
+CAPSULE_ROBOTS = {
+    r"^robot is 'prototype'; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": capsules(
+        robot="prototype"
+    )
+}
+
+
+@refusals({InputError: CAPSULE_INPUT, HostError: CAPSULE_HOSTS, RobotError: CAPSULE_ROBOTS})
+def test_capsules_that_no_model_can_have_are_a_sentence(error, sentence, call):
     spec = spec_of(POST + BALL)
     with pytest.raises(error, match=sentence):
-        add_capsules(**{"spec": spec, "robot": soft_robot(1), "host": "post"} | options)
+        call(spec)
     assert len(spec.bodies) == 3  # world, post, ball: nothing was added
 
 
-def test_rod_of_a_model_asks_for_a_robot_and_a_list():
-    rod, model, data = stand()
-    with pytest.raises(RobotError, match=r"^robot is 'prototype'; give one Robot"):
-        MujocoRod("prototype", model, data, "post")
-    with pytest.raises(HostError, match=r"^contact_bodies is 'ball'; give a list of bodies"):
-        MujocoRod(soft_robot(), model, data, "post", contact_bodies="ball")
+GHOST = '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+EGG = '<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>'
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A spec with the capsules of a rod, its model, and its data."""
+    spec = spec_of(POST + BALL + GHOST)
+    add_capsules(spec, soft_robot(), "post")
+    model = spec.compile()
+    return spec, model, mujoco.MjData(model)
+
+
+def mounted(**options):
+    """A rod on the post of the scene, with other options."""
+
+    def mount(spec, model, data):
+        MujocoRod(**{"robot": soft_robot(), "model": model, "data": data, "body": "post"} | options)
+
+    return mount
+
+
+def felt(inside, body):
+    """What a rod may touch of a model."""
+    model = spec_of(inside).compile()
+    data, number = mujoco.MjData(model), model.body(body).id
+    MujocoBodyContact(model, data, number, dt=0.005, relaxation=0.1, friction=0.3)
+
+
+def without_capsules():
+    model = spec_of(POST).compile()
+    return {"model": model, "data": mujoco.MjData(model)}
+
+
+NOT_THERE = {
+    (
+        r"^the model has no capsules of a rod 'rod'; "
+        r"call add_capsules\(\.\.\., name='rod'\) on its spec"
+    ): mounted(**without_capsules()),
+    r"^the model has a body 'rod 0' already; give each rod a name of its own": lambda spec, *_: add_capsules(
+        spec, soft_robot(), "post"
+    ),
+    r"^the model has no body 'pots'; did you mean 'post'\?": mounted(body="pots"),
+    r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$": mounted(body=99),
+    (
+        r"^the capsules of 'rod' collide with 'ball', .*; "
+        r"name it in add_capsules\(\.\.\., contact_bodies=\[\.\.\.\]\) too\.$"
+    ): mounted(contact_bodies=["ball"]),
+    r"^contact_bodies is 'ball'; give a list of bodies": mounted(contact_bodies="ball"),
+    r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": mounted(
+        quaternion=(1, 1, 0, 0)
+    ),
+    r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for another robot\.$": mounted(
+        robot=soft_robot(3)
+    ),
+    r"^the data are of another model: 2 bodies, where this one has 24\.$": mounted(
+        data=without_capsules()["data"]
+    ),
+    r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$": mounted(model="model"),
+    r"^body 'ghost' has no geom that collides, so nothing can touch it\.$": lambda *_: felt(GHOST, "ghost"),
+    r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch": lambda *_: felt(EGG, "egg"),
+}
+NO_ROBOT = {r"^robot is 'prototype'; give one Robot": mounted(robot="prototype")}
+
+
+@refusals({HostError: NOT_THERE, RobotError: NO_ROBOT})
+def test_what_is_not_there_is_a_sentence(scene, error, sentence, call):
+    with pytest.raises(error, match=sentence):
+        call(*scene)
+
+
+def test_a_rod_that_is_reset_pulls_no_more():
+    rod, _, _ = stand()
     rod.step(tip_force=(0.1, 0.0, 0.0))
     assert rod.wrench.any()
     rod.reset()
     assert not rod.wrench.any()
 
 
-def test_what_is_not_there_is_a_sentence(monkeypatch):
-    robot = soft_robot()
-    spec = spec_of(
-        POST + BALL + '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" '
-        'diaginertia="1 1 1"/></body>'
-    )
-    with pytest.raises(HostError, match=r"^spec is a str; give a mujoco.MjSpec"):
-        add_capsules("arm.xml", robot, "post")
-    with pytest.raises(HostError, match=r"^the spec has no body 'pst'; did you mean 'post'\?"):
-        add_capsules(spec, robot, "pst")
-    with pytest.raises(InputError, match=r"^0 capsules a segment; give at least one, a whole number\.$"):
-        add_capsules(spec, robot, "post", capsules_per_segment=0)
-    bare = spec_of(POST).compile()
-    with pytest.raises(
-        HostError,
-        match=r"^the model has no capsules of a rod 'rod'; call "
-        r"add_capsules\(\.\.\., name='rod'\) on its spec",
-    ):
-        MujocoRod(robot, bare, mujoco.MjData(bare), "post")
-    add_capsules(spec, robot, "post")
-    with pytest.raises(
-        HostError,
-        match=r"^the model has a body 'rod 0' already; give each rod a name of "
-        r"its own",
-    ):
-        add_capsules(spec, robot, "post")
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    for options, sentence in (
-        ({"body": "pots"}, r"^the model has no body 'pots'; did you mean 'post'\?"),
-        ({"body": 99}, r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$"),
-        (
-            {"contact_bodies": ["ball"]},
-            r"^the capsules of 'rod' collide with 'ball', .*; name it in add_capsules\(\.\.\., "
-            r"contact_bodies=\[\.\.\.\]\) too\.$",
-        ),
-        (
-            {"quaternion": (1, 1, 0, 0)},
-            r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; "
-            r"it must be 1",
-        ),
-        (
-            {"robot": soft_robot(3)},
-            r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for "
-            r"another robot\.$",
-        ),
-        (
-            {"data": mujoco.MjData(bare)},
-            r"^the data are of another model: 2 bodies, where this one has 24\.$",
-        ),
-        ({"model": "model"}, r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$"),
-    ):
-        with pytest.raises(HostError, match=sentence):
-            MujocoRod(**{"robot": robot, "model": model, "data": data, "body": "post"} | options)
-    with pytest.raises(
-        HostError, match=r"^body 'ghost' has no geom that collides, so nothing can touch it\.$"
-    ):
-        MujocoBodyContact(model, data, model.body("ghost").id, dt=0.005, relaxation=0.1, friction=0.3)
-    round_one = spec_of(
-        '<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>'
-    ).compile()
-    with pytest.raises(
-        HostError, match=r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch"
-    ):
-        MujocoBodyContact(round_one, mujoco.MjData(round_one), 1, dt=0.005, relaxation=0.1, friction=0.3)
+def test_without_mujoco_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(
-        HostError,
-        match=r"^MuJoCo is not installed; pip install 'fastrod\[mujoco\]' brings "
-        r"it\.$",
-    ):
-        fastrod.hosts.add_capsules(spec, robot, "post")
+    sentence = r"^MuJoCo is not installed; pip install 'fastrod\[mujoco\]' brings it\.$"
+    with pytest.raises(HostError, match=sentence):
+        fastrod.hosts.add_capsules(None, soft_robot(), "post")

@@ -30,7 +30,7 @@ STIFF = 1e-9  # m/N: tendons that do not stretch
 ABOUT_X = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 
 
-def wires(bend_x: float, bend_y: float) -> np.ndarray:
+def tendons(bend_x: float, bend_y: float) -> np.ndarray:
     """(4,) lengths that ask for these bends about x and y [rad]."""
     return OFFSET * np.array([-bend_y, bend_x, bend_y, -bend_x])
 
@@ -51,7 +51,7 @@ def drive(robot: Plant, times: list[float], bends: list[tuple[float, float]], ra
     fine = np.append(np.arange(times[0], times[-1], 1.0 / rate), times[-1])
     x, y = (np.interp(fine, times, axis) for axis in np.array(bends).T)
     for t, a, b in zip(fine, x, y, strict=True):
-        robot.advance(float(t), wires(a, b))
+        robot.advance(float(t), tendons(a, b))
 
 
 # ---------------------------------------------------------------- the rod
@@ -61,7 +61,7 @@ def test_without_effect_it_is_the_simulator_at_rest() -> None:
     rng = np.random.default_rng(0)
     n = 60
     angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(0.0, 1.0, n)
-    dl = np.array([wires(s * math.cos(a), s * math.sin(a)) for a, s in zip(angle, size, strict=True)])
+    dl = np.array([tendons(s * math.cos(a), s * math.sin(a)) for a, s in zip(angle, size, strict=True)])
     force = rng.normal(size=(n, 3))
     force *= 9.81 * rng.uniform(0.0, 0.1, (n, 1)) / np.linalg.norm(force, axis=1, keepdims=True)
     robot = rod()
@@ -78,10 +78,10 @@ def test_line_weight_is_the_simulators() -> None:
     robot = rod()
     for down in np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8]]):
         state = Simulator(robot, dt=0.01).settle(
-            robot.rest_tendon_length + wires(0.5, -0.6), line_force=5.0 * down
+            robot.rest_tendon_length + tendons(0.5, -0.6), line_force=5.0 * down
         )
         assert_allclose(
-            PlantRod(weight=5.0).rest(wires(0.5, -0.6), STILL, down).position,
+            PlantRod(weight=5.0).rest(tendons(0.5, -0.6), STILL, down).position,
             state.tip_position[0],
             rtol=0,
             atol=2e-6,
@@ -90,7 +90,7 @@ def test_line_weight_is_the_simulators() -> None:
 
 @pytest.mark.parametrize("bend", [0.05, 0.7, -1.3, 2.5])
 def test_without_load_it_is_an_arc(bend: float) -> None:
-    rest = PlantRod(compliance=STIFF).rest(wires(0.0, bend), STILL, DOWN)
+    rest = PlantRod(compliance=STIFF).rest(tendons(0.0, bend), STILL, DOWN)
     assert_allclose(
         rest.position,
         LENGTH / bend * np.array([1.0 - math.cos(bend), 0.0, math.sin(bend)]),
@@ -126,7 +126,7 @@ def test_spread_of_the_weight_does_not_change_its_sum() -> None:
 
 def test_a_quarter_turn_of_wires_and_loads_turns_the_shape() -> None:
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    dl, force, down = wires(0.4, -0.7), np.array([0.3, 0.5, -0.4]), np.array([0.6, 0.0, -0.8])
+    dl, force, down = tendons(0.4, -0.7), np.array([0.3, 0.5, -0.4]), np.array([0.6, 0.0, -0.8])
     it = PlantRod(weight=4.0, slope=0.1, compliance=3e-4, settling=0.3)
     one, other = it.rest(dl, force, down), it.rest(np.roll(dl, 1), quarter @ force, quarter @ down)
     assert_allclose(other.position, quarter @ one.position, rtol=0, atol=1e-10)
@@ -138,7 +138,7 @@ def test_a_warm_start_from_afar_ends_where_a_cold_one_does() -> None:
     rng = np.random.default_rng(2)
     it, last = PlantRod(weight=4.0, compliance=4e-4, settling=0.3), None
     for _ in range(25):
-        dl, force = wires(*rng.uniform(-0.7, 0.7, 2)), rng.uniform(-0.5, 0.5, 3)
+        dl, force = tendons(*rng.uniform(-0.7, 0.7, 2)), rng.uniform(-0.5, 0.5, 3)
         last = it.rest(dl, force, DOWN, last)
         cold = it.rest(dl, force, DOWN)
         assert_allclose(last.position, cold.position, rtol=0, atol=1e-8)
@@ -148,7 +148,7 @@ def test_a_warm_start_from_afar_ends_where_a_cold_one_does() -> None:
 def test_tensions_change_with_the_wires_by_their_slope() -> None:
     it, dl, force, h = (
         PlantRod(compliance=3e-4, settling=0.3, weight=3.0),
-        wires(0.3, 0.5),
+        tendons(0.3, 0.5),
         np.array([0.2, 0.1, -0.5]),
         1e-6,
     )
@@ -166,7 +166,7 @@ def test_tensions_change_with_the_wires_by_their_slope() -> None:
 
 def test_a_wire_whose_strands_settle_gives_less_the_more_it_is_pulled() -> None:
     it = PlantRod(compliance=4e-4, settling=0.3, knee=1.5)
-    dl = wires(0.0, 0.9)
+    dl = tendons(0.0, 0.9)
     rest = it.rest(dl, STILL, DOWN)
     pulled = rest.tension
     extension = 4e-4 * (0.7 * pulled + 0.3 * 1.5 * np.arcsinh(pulled / 1.5))
@@ -219,7 +219,7 @@ def test_tensions_between_two_shapes_are_those_of_the_shape() -> None:
     one, other = Plant(seal(0, "none")), Plant(seal(0, "none"))
     for k in range(60):
         t = 0.005 * k
-        dl = wires(0.8 * math.sin(2.0 * t), 0.5 * math.sin(3.0 * t))
+        dl = tendons(0.8 * math.sin(2.0 * t), 0.5 * math.sin(3.0 * t))
         one.advance(t, dl)
         other.advance(t, dl)
         other.tip()
@@ -240,7 +240,7 @@ def test_backlash_is_a_flat_spot_of_the_sealed_width() -> None:
     at = bend_of(robot.tip()[1])
     passed = []
     for k, back in enumerate(np.linspace(0.0, 3.0 * width, 31)):
-        robot.advance(1.0 + 0.01 * k, wires(0.0, 0.8 - back / OFFSET))
+        robot.advance(1.0 + 0.01 * k, tendons(0.0, 0.8 - back / OFFSET))
         passed.append(OFFSET * (at - bend_of(robot.tip()[1])))
     back = np.linspace(0.0, 3.0 * width, 31)
     flat = np.array(passed)
@@ -258,7 +258,7 @@ def test_friction_loses_the_sealed_bend_and_more_the_further_it_bends() -> None:
     drive(robot, [0.0, 1.0], [(0.0, 0.0), (0.3, 0.0)])
     lost["up", 0.3] = bend_of(robot.tip()[1])
     drive(robot, [1.0, 2.0, 3.0], [(0.3, 0.0), (1.0, 0.0), (1.6, 0.0)])
-    robot.advance(3.01, wires(1.0, 0.0))
+    robot.advance(3.01, tendons(1.0, 0.0))
     lost["down", 1.0] = bend_of(robot.tip()[1])
     drive(robot, [3.01, 4.0], [(1.0, 0.0), (0.3, 0.0)])
     lost["down", 0.3] = bend_of(robot.tip()[1])
@@ -278,7 +278,7 @@ def test_the_path_counts_and_not_its_pace(name: str) -> None:
     drive(slow, [0.0, 3.0, 6.0, 8.0, 11.0], corners)
     drive(fast, [0.0, 0.3, 0.6, 0.8, 1.1], corners, rate=730.0)
     for k, corner in enumerate(corners):
-        rare.advance(0.2 * k, wires(*corner))
+        rare.advance(0.2 * k, tendons(*corner))
     # steps of drive() do not end in the corners: they are cut by a step, up to 0.01 rad
     assert_allclose(fast.tip()[0], slow.tip()[0], rtol=0, atol=5e-6)
     assert_allclose(rare.tip()[0], slow.tip()[0], rtol=0, atol=5e-5 if name == "friction" else 5e-6)
@@ -287,7 +287,7 @@ def test_the_path_counts_and_not_its_pace(name: str) -> None:
 
 def still(bend: tuple[float, float]) -> np.ndarray:
     """(3,) tip of the robot without effect [m]."""
-    return PlantRod().rest(wires(*bend), STILL, DOWN).position
+    return PlantRod().rest(tendons(*bend), STILL, DOWN).position
 
 
 def test_creep_comes_after_a_step_and_ends_at_the_command() -> None:
@@ -295,13 +295,13 @@ def test_creep_comes_after_a_step_and_ends_at_the_command() -> None:
     whole = numbers["share"] + numbers["slow_share"]
     robot, finer = Plant(hidden("creep")), Plant(hidden("creep"))
     for it in (robot, finer):
-        it.advance(0.0, wires(0.0, 0.0))
-        it.advance(0.01, wires(0.0, 0.8))
-    aim = bend_of(PlantRod().rest(wires(0.0, 0.8), STILL, DOWN).rotation)
+        it.advance(0.0, tendons(0.0, 0.0))
+        it.advance(0.01, tendons(0.0, 0.8))
+    aim = bend_of(PlantRod().rest(tendons(0.0, 0.8), STILL, DOWN).rotation)
     left = [aim - bend_of(robot.tip()[1])]
     assert left[0] / aim == pytest.approx(whole, rel=0.03)  # of 10 ms nearly all is left
     for t in (1.0, 4.0, 16.0, 64.0, 1000.0):
-        robot.advance(t, wires(0.0, 0.8))
+        robot.advance(t, tendons(0.0, 0.8))
         left.append(aim - bend_of(robot.tip()[1]))
     assert np.all(np.diff(left) < 0.0)
     assert left[-1] == pytest.approx(0.0, abs=1e-6)
@@ -309,8 +309,8 @@ def test_creep_comes_after_a_step_and_ends_at_the_command() -> None:
     late = math.exp(-4.0 / numbers["slow_time_constant"])
     assert 0.3 * late * numbers["slow_share"] * aim < left[2] < whole * aim
     for t in np.arange(0.02, 4.0, 0.05):
-        finer.advance(float(t), wires(0.0, 0.8))
-    finer.advance(4.0, wires(0.0, 0.8))
+        finer.advance(float(t), tendons(0.0, 0.8))
+    finer.advance(4.0, tendons(0.0, 0.8))
     assert aim - bend_of(finer.tip()[1]) == pytest.approx(left[2], abs=1e-9)
 
 
@@ -321,7 +321,7 @@ def test_creep_goes_by_time_and_hardly_by_how_often_it_is_called() -> None:
     drive(often, [0.0, 4.0, 8.0, 12.0], corners, rate=500.0)
     drive(fast, [0.0, 0.4, 0.8, 1.2], corners, rate=500.0)
     for k, corner in enumerate(corners):
-        rarely.advance(4.0 * k, wires(*corner))
+        rarely.advance(4.0 * k, tendons(*corner))
     assert_allclose(slow.tip()[0], often.tip()[0], rtol=0, atol=1e-6)
     assert_allclose(rarely.tip()[0], often.tip()[0], rtol=0, atol=2e-5)
     assert np.linalg.norm(fast.tip()[0] - often.tip()[0]) > 1e-4
@@ -330,7 +330,7 @@ def test_creep_goes_by_time_and_hardly_by_how_often_it_is_called() -> None:
 def test_stretch_loses_the_sealed_share_of_a_small_bend_and_lets_a_load_turn_the_tip() -> None:
     lost = hidden("tendon_stretch").open()["tendon_stretch"]["gain_loss"]
     robot = Plant(hidden("tendon_stretch"))
-    robot.advance(0.0, wires(0.05, 0.0))
+    robot.advance(0.0, tendons(0.05, 0.0))
     # beside it the tendons' own 0.3 percent
     assert bend_of(robot.tip()[1]) == pytest.approx(0.05 * (1.0 - lost), rel=0.01)
     loaded, plain = Plant(hidden("tendon_stretch")), Plant(seal(0, "none"))
@@ -345,7 +345,7 @@ def test_latency_is_the_past_of_the_motion_and_the_tip_itself_is_not_late() -> N
     late, plain = Plant(hidden("latency")), Plant(seal(0, "none"))
     for k in range(201):
         t = 0.005 * k
-        dl = wires(0.8 * math.sin(2.0 * t), 0.5 * t)
+        dl = tendons(0.8 * math.sin(2.0 * t), 0.5 * t)
         late.advance(t, dl)
         plain.advance(t, dl)
         if k >= 100 and k % 20 == 0:
@@ -358,8 +358,8 @@ def test_latency_is_the_past_of_the_motion_and_the_tip_itself_is_not_late() -> N
             assert_allclose(late.tip()[0], now[0], rtol=0, atol=1e-9)
             assert np.linalg.norm(past[0] - now[0]) > 3e-4
     assert 0.03 < numbers["delay"] < 0.16
-    late.advance(2.0, wires(0.3, 0.5))
-    late.advance(3.0, wires(0.3, 0.5))
+    late.advance(2.0, tendons(0.3, 0.5))
+    late.advance(3.0, tendons(0.3, 0.5))
     assert_allclose(late.tip_seen()[0], late.tip()[0], rtol=0, atol=1e-9)
 
 
@@ -377,8 +377,8 @@ def test_a_load_is_seen_as_late_as_the_motion() -> None:
 
 def test_between_two_calls_the_wires_go_straight() -> None:
     robot = Plant(seal(0, "none"))
-    robot.advance(0.0, wires(0.0, 0.0))
-    robot.advance(0.1, wires(0.4, 0.2))
+    robot.advance(0.0, tendons(0.0, 0.0))
+    robot.advance(0.1, tendons(0.4, 0.2))
     assert_allclose(robot.tip(0.075)[0], still((0.3, 0.15)), rtol=0, atol=1e-8)
     assert_allclose(robot.tip(7.0)[0], still((0.4, 0.2)), rtol=0, atol=1e-8)
     assert_allclose(robot.tip(-1.0)[0], still((0.0, 0.0)), rtol=0, atol=1e-8)
@@ -387,10 +387,10 @@ def test_between_two_calls_the_wires_go_straight() -> None:
 def test_a_bumped_camera_sees_another_tip_and_the_robot_stays() -> None:
     numbers = hidden("bump").open()["bump"]
     robot = Plant(hidden("bump"))
-    robot.advance(5.0, wires(0.2, 0.1))
-    robot.advance(5.0 + numbers["at"] - 0.1, wires(0.2, 0.1))
+    robot.advance(5.0, tendons(0.2, 0.1))
+    robot.advance(5.0 + numbers["at"] - 0.1, tendons(0.2, 0.1))
     before = robot.tip_seen()
-    robot.advance(5.0 + numbers["at"] + 0.1, wires(0.2, 0.1))
+    robot.advance(5.0 + numbers["at"] + 0.1, tendons(0.2, 0.1))
     after = robot.tip_seen()
     assert_allclose(before[0], robot.tip()[0], rtol=0, atol=1e-12)
     assert 5e-4 < np.linalg.norm(after[0] - before[0]) < 6e-3
@@ -407,8 +407,10 @@ def test_ripple_comes_again_with_every_turn_of_the_drum() -> None:
     bend = np.linspace(0.0, 2.0, 81)
     error = []
     for k, b in enumerate(bend):
-        robot.advance(0.01 * k, wires(0.0, b))
-        error.append(bend_of(robot.tip()[1]) - bend_of(PlantRod().rest(wires(0.0, b), STILL, DOWN).rotation))
+        robot.advance(0.01 * k, tendons(0.0, b))
+        error.append(
+            bend_of(robot.tip()[1]) - bend_of(PlantRod().rest(tendons(0.0, b), STILL, DOWN).rotation)
+        )
     error = OFFSET * np.array(error)
     swing = numbers["amplitude"] + numbers["tooth_amplitude"]
     assert 0.3 * swing < np.ptp(error) < 2.1 * swing
@@ -427,7 +429,7 @@ def test_every_effect_moves_the_tip_by_millimetres(kind: str, seed: int) -> None
     for k in range(3001):  # 120 s
         bend = 0.45 * np.sin(2.0 * np.pi * frequency * 0.04 * k + phase).sum(axis=1)
         for it in (robot, plain):
-            it.advance(0.04 * k, wires(*bend.tolist()))
+            it.advance(0.04 * k, tendons(*bend.tolist()))
         if k % 50 == 0:
             apart.append(robot.tip_seen()[0] - plain.tip_seen()[0])
     assert 0.5e-3 < np.sqrt(np.mean(np.sum(np.array(apart) ** 2, axis=1))) < 6e-3
@@ -456,7 +458,7 @@ def test_a_seal_tells_nothing_until_it_is_opened() -> None:
     for kind in NAMES:
         closed = seal(4, kind)
         robot = Plant(closed)
-        robot.advance(0.0, wires(0.3, 0.3))
+        robot.advance(0.0, tendons(0.3, 0.3))
         robot.tip()
         assert repr(closed) == str(closed) == f"{closed}" == "sealed"
         assert repr(robot) == "Plant(sealed)"
@@ -514,7 +516,7 @@ def test_wrong_names_and_seeds_say_so() -> None:
 
 def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
     robot = Plant(seal(0, "friction"))
-    robot.advance(1.0, wires(0.2, 0.2))
+    robot.advance(1.0, tendons(0.2, 0.2))
     before = robot.tip()[0]
     for wrong in ([0.0] * 3, [0.0] * 5, [0.0, 0.0, "a", 0.0], np.zeros((4, 1)), None):
         with pytest.raises(InputError, match="it must be four lengths of tendon"):

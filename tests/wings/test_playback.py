@@ -1,7 +1,4 @@
-"""Playback: the same figures as `replay`, the true shape behind every predicted tip, and a clock without
-pauses."""
-
-from __future__ import annotations
+"""Playback: the figures of `replay`, the true shape behind every predicted tip, a clock without pauses."""
 
 import json
 from dataclasses import replace
@@ -43,10 +40,9 @@ def with_(*effects: dict[str, object]) -> Robot:
 def test_figures_are_those_of_replay(demo: RunLog, robot: Robot) -> None:
     made, straight = Playback.of(demo, robot), replay(demo, robot)
     assert_array_equal(made.origin, np.flatnonzero(demo.driven))
+    residual = np.linalg.norm(straight.residual, axis=1)[made.origin]
     assert_allclose(made.before.tip_position, straight.tip_position[made.origin], rtol=0, atol=1e-12)
-    assert_allclose(
-        made.before.residual, np.linalg.norm(straight.residual, axis=1)[made.origin], rtol=0, atol=1e-12
-    )
+    assert_allclose(made.before.residual, residual, rtol=0, atol=1e-12)
     assert made.before.rms == pytest.approx(straight.rms, rel=1e-12)
     assert made.before.rms_of(np.ones(len(made.log), bool)) == pytest.approx(straight.rms, rel=1e-12)
 
@@ -68,11 +64,8 @@ def test_the_drawn_tip_is_the_predicted_tip(demo: RunLog, robot: Robot) -> None:
     along = np.linalg.norm(np.diff(shapes.position, axis=1), axis=2).sum(axis=1)
     # the backbone does not stretch; chords are a little short
     assert_allclose(along, ROBOT.length, rtol=1e-3)
-    assert_allclose(
-        np.swapaxes(shapes.rotation, 2, 3) @ shapes.rotation,
-        np.broadcast_to(np.eye(3), shapes.rotation.shape),
-        atol=1e-7,
-    )
+    unit = np.swapaxes(shapes.rotation, 2, 3) @ shapes.rotation
+    assert_allclose(unit, np.broadcast_to(np.eye(3), unit.shape), atol=1e-7)
     slope = shapes.position[:, 1] - shapes.position[:, 0]
     # tangent, camera and all
     assert_allclose(slope / np.linalg.norm(slope, axis=1)[:, None], shapes.rotation[:, 0, :, 2], atol=0.05)
@@ -164,15 +157,12 @@ def folder(tmp_path: Path, demo: RunLog) -> Path:
 
 def test_an_identification_beside_the_log_is_found(folder: Path, demo: RunLog) -> None:
     made = load(folder / "wobble.csv", frames=20)
-    assert made.after is not None
-    assert made.findings is not None
     assert made.after.robot == with_(MEMORY, MARKER)
     assert made.before.robot == with_(MARKER)  # only what was found is switched off
     assert (made.before.label, made.after.label) == (SWITCHED_OFF, "with backlash")
     assert made.findings.effects == ("backlash",)
     assert made.findings.held_out_rms[0] == 3e-3
     assert np.isnan(made.findings.held_out_rms[1])
-    assert made.tested is not None
     assert made.tested.mean() == pytest.approx(0.25, abs=0.01)
     assert made.after.rms == pytest.approx(replay(demo, with_(MEMORY, MARKER)).rms, rel=1e-12)
     assert made.before.rms == pytest.approx(replay(demo, with_(MARKER)).rms, rel=1e-12)
@@ -219,13 +209,10 @@ def test_identify_shows_before_and_after(demo: RunLog) -> None:
     noise = np.random.default_rng(2).normal(0.0, 2e-4, (len(few), 3))
     log = replace(few, tip_position=truth.tip_position + noise).rows(truth.converged)
     made = identify(Playback.of(log, ROBOT, frames=20), frames=20)
-    assert made.findings is not None
-    assert made.after is not None
     assert "drum_gain" in made.findings.effects
     assert made.before.label == BEFORE
     assert made.nominal == ROBOT
     assert made.after.rms < 5e-4 < made.before.rms
-    assert made.tested is not None
     before, after = made.findings.held_out_rms
     assert made.after.rms_of(made.tested) == pytest.approx(after, rel=0.05)  # the report leaves outliers out
     assert made.before.rms_of(made.tested) == pytest.approx(before, rel=0.05)
@@ -235,11 +222,9 @@ def test_live_curves_keep_every_peak(demo: RunLog) -> None:
     made = Playback.of(demo, ROBOT, with_(MEMORY), frames=20)
     for most in (200, 2000, 10_000):
         shown = curves(made, most)
-        assert shown.after is not None
         assert len(shown.time) == len(shown.before) == len(shown.after) <= most
         assert (np.diff(shown.time) >= 0.0).all()
         for line, track in ((shown.before, made.before), (shown.after, made.after)):
-            assert track is not None
             assert np.nanmax(line) == 1e3 * np.nanmax(track.residual)
             assert np.nanmin(line) == 1e3 * np.nanmin(track.residual)
     assert len(curves(made, 10_000).time) == len(made.log)
@@ -248,10 +233,8 @@ def test_live_curves_keep_every_peak(demo: RunLog) -> None:
 
 
 def test_live_curves_break_between_runs(demo: RunLog) -> None:
-    log = replace(
-        demo.rows(slice(0, 600)), run=np.repeat(["a", "b", "c"], 200), t=np.tile(0.1 * np.arange(200.0), 3)
-    )
-    made = Playback.of(log, ROBOT, frames=20)
+    runs = {"run": np.repeat(["a", "b", "c"], 200), "t": np.tile(0.1 * np.arange(200.0), 3)}
+    made = Playback.of(replace(demo.rows(slice(0, 600)), **runs), ROBOT, frames=20)
     for most in (100, 2000):
         shown = curves(made, most)
         assert len(shown.time) <= most

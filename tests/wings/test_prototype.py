@@ -1,21 +1,21 @@
-"""The prototype as a robot link: what it is told, what it records, what homing finds, how it starts and
+"""The prototype as a robot link: what it is commanded, what it records, what homing finds, how it starts and
 ends."""
 
 from __future__ import annotations
 
 import csv
-import itertools
 import shutil
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from benches import started
 
 from fastrod.errors import InputError
 from fastrod.logs.link import RobotLink
@@ -32,7 +32,6 @@ from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
-from fastrod_device.seal import seal
 from fastrod_device.trace import Trace
 from fastrod_device.workbench import emulated
 
@@ -53,51 +52,11 @@ PATIENT = replace(
     HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, following_error=0.05, **_YOUNG)
 )
 BENT = np.array([-0.002, 0.001, 0.002, -0.001])
-_names = itertools.count()
 
 
-class Changed:
-    """The emulator's camera, with something done to each of its frames."""
-
-    def __init__(self, emulator: Emulator, change: Callable[[CameraFrame], CameraFrame]) -> None:
-        self.emulator, self.change = emulator, change
-
-    def read(self) -> CameraFrame | None:
-        frame = self.emulator.read()
-        return None if frame is None else self.change(frame)
-
-    def close(self) -> None:
-        pass
-
-
-@contextmanager
-def bench(
-    clock: Clock | None = None,
-    *,
-    camera: bool = True,
-    hardware: Any = HARDWARE,
-    change: Callable[[CameraFrame], CameraFrame] | None = None,
-    journal: Journal | None = None,
-) -> Iterator[tuple[Prototype, Emulator]]:
-    """Started, with tendons that have their pretension at power-on; `change` is made to each frame."""
-    clock, bus = SteppedClock() if clock is None else clock, f"virtual:prototype-{next(_names)}"
-    with pytest.MonkeyPatch.context() as patch:
-        if not clock.stepped:  # drives that bear a busy machine, too
-            patch.setattr("fastrod_device.configuring.PATIENCE", 8.0)
-            patch.setattr("fastrod_device.cycle._PAUSE", 7.0)
-        emulator = Emulator(hardware, bus, clock=clock, seal=seal(5, "none"), seed=5, taut=True)
-        try:
-            source = None if not camera else emulator if change is None else Changed(emulator, change)
-            with Prototype(hardware, bus, source, clock=clock, journal=journal) as prototype:
-                try:
-                    prototype.start(home=False)
-                    yield prototype, emulator
-                finally:
-                    if prototype.recorder is not None and prototype.recorder.recording:
-                        with suppress(InputError):
-                            prototype.recorder.stop()
-        finally:
-            emulator.close()
+def bench(clock: Clock | None = None, *, hardware: Any = HARDWARE, **how: Any) -> Any:
+    """As `benches.started`, of the prototype's own hardware."""
+    return started(hardware, clock, **how)
 
 
 @contextmanager
@@ -166,11 +125,11 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("reported", "words"),
     [
         ({"dl": [-0.0081, 0.0, 0.0081, 0.0]}, "the limit is|limit is 8 mm"),
-        ({"dl": [0.0, np.nan, 0.0, 0.0]}, "tendon 2 was told nan m"),
-        ({"dl": [0.0, 0.0, np.inf, 0.0]}, "tendon 3 was told inf m"),
+        ({"dl": [0.0, np.nan, 0.0, 0.0]}, "tendon 2 was commanded nan m"),
+        ({"dl": [0.0, 0.0, np.inf, 0.0]}, "tendon 3 was commanded inf m"),
         ({"dl": [0.0, 0.0, 0.0]}, "shape"),
         ({"dl": ["a", 0.0, 0.0, 0.0]}, "4 numbers"),
         ({"dl": BENT, "ext": [0.001]}, "extend"),
@@ -178,13 +137,13 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
         ({"dl": BENT, "age": -0.6}, "meant -600 ms ago"),
     ],
 )
-def test_what_is_refused_never_reaches_the_bus(told: dict[str, Any], words: str) -> None:
+def test_what_is_refused_never_reaches_the_bus(reported: dict[str, Any], words: str) -> None:
     with bench() as (prototype, emulator):
         prototype.wait(0.1)
-        stamp = prototype.clock.now() - told["age"] if "age" in told else None
+        stamp = prototype.clock.now() - reported["age"] if "age" in reported else None
         with overheard(prototype, emulator) as rows:
             with pytest.raises(RefusedError, match=words):
-                prototype.command(told["dl"], told.get("ext"), stamp=stamp)
+                prototype.command(reported["dl"], reported.get("ext"), stamp=stamp)
             prototype.wait(0.2)
         assert len(rows) >= 20
         assert len(set(rows)) == 1
@@ -267,9 +226,9 @@ def test_rows_have_the_wires_of_the_moment_of_exposure(tmp_path: Any) -> None:
         prototype.record(None)
         rows = len(recorder)
         log = recorder.stop()
-        times, wires = np.array([t for t, _ in true]), np.array([dl for _, dl in true])
+        times, lengths = np.array([t for t, _ in true]), np.array([dl for _, dl in true])
         offset = began - prototype._zero
-        expected = np.stack([np.interp(log.t + offset, times, wires[:, k]) for k in range(4)], axis=1)
+        expected = np.stack([np.interp(log.t + offset, times, lengths[:, k]) for k in range(4)], axis=1)
         late = log.t > 0.1
         # the plant lives between two cycles by the same straight lines; a count is 0.6 um, a cycle of lag
         # would be 90 um
@@ -724,14 +683,14 @@ def test_a_plan_that_hangs_is_found_by_the_watchdog_and_the_drives_stop() -> Non
 def test_a_glide_spreads_a_command_evenly() -> None:
     with bench() as (robot, _):
         robot.glide(BENT, 0.4)
-        told = []
+        reported = []
         for _ in range(60):
             robot.wait(0.01)
-            told.append(robot.commanded)
-        steps = np.abs(np.diff(told, axis=0)).max(axis=1)
+            reported.append(robot.commanded)
+        steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
         even = np.abs(BENT).max() / 0.4 * 0.01
         np.testing.assert_allclose(steps[:38], even, rtol=1e-6)
-        np.testing.assert_allclose(told[-1], BENT, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(reported[-1], BENT, rtol=0, atol=1e-9)
         with pytest.raises(RefusedError, match="positive time"):
             robot.glide(np.zeros(4), 0.0)
 

@@ -34,20 +34,33 @@ def seen(robots, state, place=None):
     return DrawnRods(robots, state, np.zeros((len(state.ok), 3)) if place is None else place, radius)
 
 
-def bent(name, n_robots=1, seed=3, points=20):
-    """A simulator of robots bent at random, and their state."""
+def bent(name, n_robots=1, points=20, place=None):
+    """Robots bent at random as they are drawn, their simulator and their state."""
     robot = fastrod.load_robot(name)
     simulator = fastrod.Simulator(robot, n_robots, points_per_segment=points)
-    if not robot.n_tendons:
-        return robot, simulator, simulator.settle()
-    moves = np.random.default_rng(seed).uniform(-0.004, 0.004, (n_robots, robot.n_segments, 3)) * [
-        0.0,
-        1.0,
-        1.0,
-    ]
-    state = simulator.settle(**SegmentActions(robot).inputs(moves.reshape(n_robots, -1)))
+    inputs = {}
+    if robot.n_tendons:
+        moves = np.random.default_rng(3).uniform(-0.004, 0.004, (n_robots, robot.n_segments, 3))
+        inputs = SegmentActions(robot).inputs((moves * [0.0, 1.0, 1.0]).reshape(n_robots, -1))
+    state = simulator.settle(**inputs)
     assert state.ok.all()
-    return robot, simulator, state
+    return seen(robot, state, place), simulator, state
+
+
+def drawn(rods, tip_force=None, **options):
+    """The batches of one picture, each of them sound."""
+    return check(Picture(rods, ViewOptions(**options)).frame(rods, tip_force=tip_force))
+
+
+def lost(state, rows):
+    """The state as it is when robots of these rows have no shape."""
+    gone = {}
+    for name in ("position", "rotation", "curvature", "arclength", "tension"):
+        gone[name] = getattr(state, name).copy()
+        gone[name][rows] = np.nan
+    ok = np.ones(len(state.ok), bool)
+    ok[rows] = False
+    return replace(state, ok=ok, **gone)
 
 
 def ends(batch):
@@ -59,30 +72,23 @@ def ends(batch):
 def check(batches):
     for batch in batches.values():
         n = len(batch.position)
-        assert (batch.position.shape, batch.wxyz.shape, batch.scale.shape, batch.color.shape) == (
-            (n, 3),
-            (n, 4),
-            (n, 3),
-            (n, 3),
-        )
-        assert (batch.position.dtype, batch.wxyz.dtype, batch.scale.dtype, batch.color.dtype) == (
-            np.float32,
-        ) * 3 + (np.uint8,)
+        arrays = (batch.position, batch.wxyz, batch.scale, batch.color)
+        assert [a.shape for a in arrays] == [(n, 3), (n, 4), (n, 3), (n, 3)]
+        assert [a.dtype for a in arrays] == [np.float32] * 3 + [np.uint8]
         assert all(np.isfinite(a).all() for a in batch[1:])
         assert_allclose(np.linalg.norm(batch.wxyz, axis=1), 1.0, atol=1e-6)
         assert (batch.scale >= 0.0).all()
     return batches
 
 
-# -- the rod
-# ----------------------------------------------------------------------------------------------------
+# the rod
 
 
 def test_pieces_of_an_arc_lie_on_the_arc():
     robot = rod(compliance=0.0)  # tendons that do not stretch bend it by just the angle
     angle = 1.2
     state = fastrod.Simulator(robot).settle(bend(robot, 0.0, angle))
-    body = check(Picture(seen(robot, state), ViewOptions(tendons=False)).frame(seen(robot, state)))["body"]
+    body = drawn(seen(robot, state), tendons=False)["body"]
     n, length = 40, 0.07
     middle = (np.arange(n) + 0.5) / n * angle
     step = angle / n
@@ -96,24 +102,19 @@ def test_pieces_of_an_arc_lie_on_the_arc():
 @pytest.mark.parametrize("name", fastrod.robot_names())
 @pytest.mark.parametrize("points", [4, 10, 20])
 def test_line_follows_the_rod(name, points):
-    robot, simulator, state = bent(name, points=points)
-    picture = Picture(seen(robot, state))
-    body = check(picture.frame(seen(robot, state)))["body"]
-    p = picture.pieces
-    at = np.linspace(0.0, 1.0, p + 1)
-    joints = state.arclength[0, ::points]
+    rods, simulator, state = bent(name, points=points)
+    picture = Picture(rods)
+    body, p = check(picture.frame(rods))["body"], picture.pieces
+    at, joints = np.linspace(0.0, 1.0, p + 1), state.arclength[0, ::points]
     s = np.concatenate([a + at * (b - a) for a, b in itertools.pairwise(joints)])
     pose = simulator.shape(np.minimum(s, joints[-1]))
-    points_on = pose.position[0].reshape(-1, p + 1, 3)
-    tolerance = 1e-4 * robot.length if points == 4 else 1e-5 * robot.length
-    assert_allclose(
-        body.position.reshape(-1, p, 3), 0.5 * (points_on[:, 1:] + points_on[:, :-1]), atol=tolerance
-    )
-    chord = points_on[:, 1:] - points_on[:, :-1]
+    on = pose.position[0].reshape(-1, p + 1, 3)
+    tolerance, angle = (1e-4, 0.01) if points == 4 else (1e-5, 1e-3)
+    middle = 0.5 * (on[:, 1:] + on[:, :-1])
+    assert_allclose(body.position.reshape(-1, p, 3), middle, atol=tolerance * rods.robots[0].length)
+    chord = on[:, 1:] - on[:, :-1]
     size = np.linalg.norm(chord, axis=-1, keepdims=True)
-    assert_allclose(
-        tangents(body.wxyz.astype(float)).reshape(-1, p, 3), chord / size, atol=0.01 if points == 4 else 1e-3
-    )
+    assert_allclose(tangents(body.wxyz.astype(float)).reshape(-1, p, 3), chord / size, atol=angle)
     # neighbours overlap, by the radius times the angle between them, so that no wedge opens on the outside of
     # the bend
     over = body.scale[:, 2].reshape(-1, p, 1) - size
@@ -127,33 +128,30 @@ def test_line_follows_the_rod(name, points):
 def test_nodes_that_are_not_even_do_not_show():
     robot = fastrod.load_robot("tdcr_a")
     simulator = fastrod.Simulator(robot, points_per_segment=20)
-    state = simulator.settle(
-        robot.rest_tendon_length, point_force=[(0.133, (0.1, 0.0, 0.0)), (0.207, (0.0, 0.1, 0.0))]
-    )
+    loads = [(0.133, (0.1, 0.0, 0.0)), (0.207, (0.0, 0.1, 0.0))]
+    state = simulator.settle(robot.rest_tendon_length, point_force=loads)
     assert np.ptp(np.diff(state.arclength[0])) > 1e-3
-    body = Picture(seen(robot, state)).frame(seen(robot, state))["body"]
+    body = drawn(seen(robot, state))["body"]
     assert_allclose(np.linalg.norm(np.diff(body.position[:40], axis=0), axis=1), 0.2 / 40, rtol=1e-3)
     assert_allclose(body.position, simulator.shape((np.arange(80) + 0.5) * 0.4 / 80).position[0], atol=1e-5)
 
 
 def test_tip_is_at_the_tip():
-    robot, _, state = bent("five_segment_reacher", n_robots=3)
-    tip = Picture(seen(robot, state), ViewOptions(body="skin")).frame(seen(robot, state))["tip"]
+    rods, _, state = bent("five_segment_reacher", n_robots=3)
+    tip = drawn(rods, body="skin")["tip"]
     assert tip.shape == "cap"
     assert_allclose(tip.position, state.tip_position, atol=1e-6)
     assert_allclose(tangents(tip.wxyz.astype(float)), state.tip_rotation[:, :, 2], atol=1e-6)
     assert_allclose(tip.scale, 0.012)
 
 
-# -- what sits on it
-# ----------------------------------------------------------------------------------------------------
+# what sits on it
 
 
 @pytest.mark.parametrize("name", ["prototype", "tdcr_a", "tdcr_b", "five_segment_reacher"])
 def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
-    robot, simulator, state = bent(name)
-    rods = seen(robot, state)
-    tendons = check(Picture(rods).frame(rods))["tendons"]
+    rods, simulator, state = bent(name)
+    robot, tendons = rods.robots[0], drawn(rods)["tendons"]
     first, last = ends(tendons)
     pieces = 10
     pairs = [(t, k) for t, end in enumerate(robot.tendon_segment) for k in range(end + 1)]
@@ -162,11 +160,8 @@ def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
     total = np.zeros(robot.n_tendons)
     for i, (t, k) in enumerate(pairs):
         own = slice(pieces * i, pieces * (i + 1))
-        pose = simulator.shape(
-            np.minimum(
-                joints[k] + np.linspace(0.0, 1.0, pieces + 1) * (joints[k + 1] - joints[k]), joints[-1]
-            )
-        )
+        s = joints[k] + np.linspace(0.0, 1.0, pieces + 1) * (joints[k + 1] - joints[k])
+        pose = simulator.shape(np.minimum(s, joints[-1]))
         offset = np.array([*robot.tendons[t].position(int(robot.tendon_segment[t]) + 1)[k], 0.0])
         on = pose.position[0] + pose.rotation[0] @ offset
         assert_allclose(tendons.position[own], 0.5 * (on[1:] + on[:-1]), atol=2e-6)
@@ -178,17 +173,16 @@ def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
 
 
 def test_tendons_on_the_skin_are_on_its_surface():
-    robot, _, state = bent("tdcr_b")
-    rods = seen(robot, state)
-    assert "tendons" not in Picture(rods, ViewOptions(body="skin")).frame(rods)
-    found = Picture(rods, ViewOptions(body="skin", color_by="tension", pieces=32)).frame(rods)
+    rods, _, _ = bent("tdcr_b")
+    assert "tendons" not in drawn(rods, body="skin")
+    found = drawn(rods, body="skin", color_by="tension", pieces=32)
     nearest = np.linalg.norm(found["tendons"].position[:, None] - found["body"].position, axis=2).min(1)
     assert_allclose(nearest, 0.012, atol=4e-4)
 
 
 def test_a_spacer_stands_at_the_base_and_at_the_end_of_every_segment():
-    robot, _, state = bent("five_segment_reacher")
-    spacers = check(Picture(seen(robot, state)).frame(seen(robot, state)))["spacers"]
+    rods, _, state = bent("five_segment_reacher")
+    spacers = drawn(rods)["spacers"]
     assert spacers.shape == "disc"
     for k in range(6):
         away = np.linalg.norm(spacers.position - state.position[0, 20 * k], axis=1)
@@ -202,21 +196,16 @@ def test_a_spacer_stands_at_the_base_and_at_the_end_of_every_segment():
 
 
 def test_robot_without_tendons_is_its_body():
-    robot, _, state = bent("ethz_beam")
-    rods = seen(robot, state)
-    found = check(Picture(rods, ViewOptions(color_by="tension")).frame(rods))
+    rods, _, _ = bent("ethz_beam")
+    options = ViewOptions(color_by="tension")
+    picture = Picture(rods, options)
+    found = check(picture.frame(rods))
     assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
     assert_allclose(found["body"].scale[:, 0], 0.015)
-    assert (
-        "no tendons"
-        in legend(
-            rods, ViewOptions(color_by="tension"), Picture(rods, ViewOptions(color_by="tension"))
-        ).html()
-    )
+    assert "no tendons" in legend(rods, options, picture).html()
 
 
-# -- frames
-# ----------------------------------------------------------------------------------------------------
+# frames
 
 
 @pytest.mark.parametrize(
@@ -229,9 +218,9 @@ def test_counts_stay_over_a_rollout(options):
     simulator = fastrod.Simulator(robot, 2, points_per_segment=10)
     picture, counts = None, []
     for k in range(20):
-        state = simulator.step(**actions.inputs(np.tile([0.0, 0.003 * k / 20, 0.001], 5)))
-        picture = picture or Picture(seen(robot, state), options)
-        found = check(picture.frame(seen(robot, state), tip_force=np.array([0.0, 0.01 * k, 0.0])))
+        rods = seen(robot, simulator.step(**actions.inputs(np.tile([0.0, 0.003 * k / 20, 0.001], 5))))
+        picture = picture or Picture(rods, options)
+        found = check(picture.frame(rods, tip_force=np.array([0.0, 0.01 * k, 0.0])))
         counts.append({name: len(batch.position) for name, batch in found.items()})
     assert all(count == counts[0] for count in counts)
     assert counts[0]["body"] == 2 * 5 * 40
@@ -239,27 +228,27 @@ def test_counts_stay_over_a_rollout(options):
 
 @pytest.mark.parametrize("color_by", ["segment", "curvature", "tension"])
 def test_batch_is_its_robots(color_by):
-    robot, _, state = bent("tdcr_a", n_robots=3)
-    place = grid_places(3, 0.5)
-    picture = Picture(seen(robot, state, place), ViewOptions(color_by=color_by))
-    many = picture.frame(seen(robot, state, place), tip_force=np.eye(3))
+    place, options = grid_places(3, 0.5), ViewOptions(color_by=color_by)
+    rods, _, state = bent("tdcr_a", n_robots=3, place=place)
+    picture = Picture(rods, options)
+    many = picture.frame(rods, tip_force=np.eye(3))
     along = [name for name, value in vars(state).items() if isinstance(value, np.ndarray)]
     for i in range(3):
         one = replace(state, **{name: getattr(state, name)[i : i + 1] for name in along})
-        single = Picture(seen(robot, one, place[i : i + 1]), ViewOptions(color_by=color_by))
+        alone = seen(rods.robots, one, place[i : i + 1])
+        single = Picture(alone, options)
         if picture.range is not None:
             single.range = picture.range
-        for name, batch in single.frame(seen(robot, one, place[i : i + 1]), tip_force=np.eye(3)[i]).items():
+        for name, batch in single.frame(alone, tip_force=np.eye(3)[i]).items():
             n = len(batch.position)
             for mine, theirs in zip(batch[1:], many[name][1:], strict=True):
                 assert_array_equal(mine, theirs[i * n : (i + 1) * n])
 
 
 def test_place_moves_the_picture():
-    robot, _, state = bent("prototype", n_robots=2)
+    rods, _, state = bent("prototype", n_robots=2)
     place = grid_places(2, 0.4)
-    here = Picture(seen(robot, state)).frame(seen(robot, state))
-    there = Picture(seen(robot, state, place)).frame(seen(robot, state, place))
+    here, there = drawn(rods), drawn(seen(rods.robots, state, place))
     for name in here:
         if not here[name].scale.any():  # arrows of loads that are not there
             continue
@@ -268,28 +257,15 @@ def test_place_moves_the_picture():
 
 
 def test_many_robots_are_drawn_light():
-    robot, _, state = bent("prototype", n_robots=17, points=10)
-    found = check(
-        Picture(seen(robot, state), ViewOptions(tendons=True, spacers=True)).frame(seen(robot, state))
-    )
+    found = drawn(bent("prototype", n_robots=17, points=10)[0], tendons=True, spacers=True)
     assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
     assert len(found["body"].position) == 17 * 10
 
 
 def test_robot_that_is_lost_stays_and_is_red():
-    robot, _, state = bent("prototype", n_robots=2)
-    picture = Picture(seen(robot, state))
-    before = picture.frame(seen(robot, state))
-    along = ("position", "rotation", "curvature", "arclength", "tension")
-    gone = {
-        name: np.where(
-            np.arange(2).reshape(-1, *[1] * (getattr(state, name).ndim - 1)) == 1,
-            np.nan,
-            getattr(state, name),
-        )
-        for name in along
-    }
-    after = check(picture.frame(seen(robot, replace(state, ok=np.array([True, False]), **gone))))
+    rods, _, state = bent("prototype", n_robots=2)
+    picture = Picture(rods)
+    before, after = picture.frame(rods), check(picture.frame(seen(rods.robots, lost(state, [1]))))
     assert_array_equal(after["body"].position, before["body"].position)
     assert_array_equal(after["tendons"].position, before["tendons"].position)
     red = after["body"].color.reshape(2, -1, 3).astype(int)
@@ -298,59 +274,40 @@ def test_robot_that_is_lost_stays_and_is_red():
 
 
 def test_robot_that_was_never_there_is_straight():
-    robot, _, state = bent("prototype")
-    gone = {
-        name: np.full_like(getattr(state, name), np.nan)
-        for name in ("position", "rotation", "curvature", "arclength", "tension")
-    }
-    rods = seen(robot, replace(state, ok=np.array([False]), **gone))
-    found = check(Picture(rods).frame(rods))
+    rods, _, state = bent("prototype")
+    found = drawn(seen(rods.robots, lost(state, [0])))
     assert_allclose(found["body"].position[:, 2], (np.arange(40) + 0.5) * 0.07 / 40, atol=1e-7)
 
 
-# -- colours
-# ----------------------------------------------------------------------------------------------------
+# colours
 
 
 def test_segments_have_colours_of_their_own():
-    robot, _, state = bent("five_segment_reacher")
-    color = Picture(seen(robot, state)).frame(seen(robot, state))["body"].color.reshape(5, 40, 3)
+    color = drawn(bent("five_segment_reacher")[0])["body"].color.reshape(5, 40, 3)
     assert (color == color[:, :1]).all()
     assert len(np.unique(color[:, 0], axis=0)) == 5
-    apart = [
-        np.abs(np.subtract(a, b)).sum() for i, a in enumerate(palette.SEGMENTS) for b in palette.SEGMENTS[:i]
-    ]
     assert len(palette.SEGMENTS) >= 8
-    assert min(apart) > 60
+    assert min(np.abs(np.subtract(*pair)).sum() for pair in itertools.combinations(palette.SEGMENTS, 2)) > 60
 
 
 def test_more_bend_is_brighter():
     robot = fastrod.load_robot("prototype")
     lengths = np.stack([bend(robot, 0.0, angle) for angle in (0.1, 0.5, 0.9, 1.3)])
-    state = fastrod.Simulator(robot, 4).settle(lengths)
-    brightness = {}
+    rods = seen(robot, fastrod.Simulator(robot, 4).settle(lengths))
+    luminance, largest = np.array([0.2126, 0.7152, 0.0722]), 1.3 / 0.07
     for color_by in ("curvature", "strain"):
-        picture = Picture(seen(robot, state), ViewOptions(color_by=color_by))
-        color = picture.frame(seen(robot, state))["body"].color.reshape(4, 40, 3)
-        brightness[color_by] = color.mean(1) @ [0.2126, 0.7152, 0.0722]
-        assert (np.diff(brightness[color_by]) > 10.0).all()
-    table = palette.SEQUENTIAL @ np.array([0.2126, 0.7152, 0.0722])
-    assert (np.diff(table) > -0.8).all()  # of 255: rounding
-    largest = 1.3 / 0.07
-    assert (
-        largest
-        <= Picture(seen(robot, state), ViewOptions(color_by="curvature")).range.see(np.array([largest]))
-        <= 1.5 * largest
-    )
+        color = drawn(rods, color_by=color_by)["body"].color.reshape(4, 40, 3)
+        assert (np.diff(color.mean(1) @ luminance) > 10.0).all()
+    assert (np.diff(palette.SEQUENTIAL @ luminance) > -0.8).all()  # of 255: rounding
+    top = Picture(rods, ViewOptions(color_by="curvature")).range.see(np.array([largest]))
+    assert largest <= top <= 1.5 * largest
 
 
 def test_proximal_segment_has_its_own_curvature_up_to_the_joint():
     robot = fastrod.load_robot("tdcr_a")
-    actions = SegmentActions(robot)
-    weightless = replace(robot, gravity=(0.0, 0.0, 0.0))
-    state = fastrod.Simulator(weightless).settle(**actions.inputs([0.0, 0.008, 0.0, 0.0, -0.001, 0.0]))
-    picture = Picture(seen(robot, state), ViewOptions(color_by="curvature"))
-    color = picture.frame(seen(robot, state))["body"].color.reshape(2, 40, 3).astype(int)
+    inputs = SegmentActions(robot).inputs([0.0, 0.008, 0.0, 0.0, -0.001, 0.0])
+    state = fastrod.Simulator(replace(robot, gravity=(0.0, 0.0, 0.0))).settle(**inputs)
+    color = drawn(seen(robot, state), color_by="curvature")["body"].color.reshape(2, 40, 3).astype(int)
     assert np.abs(np.diff(color[0], axis=0)).max() <= 4
     assert np.abs(color[0, -1] - color[1, 0]).max() > 60
 
@@ -360,8 +317,7 @@ def test_range_grows_and_does_not_shrink():
     assert scale.top == 1.0
     assert scale.see(np.array([-2.4, 0.1])) == 3.0
     assert scale.see(np.array([0.1])) == 3.0
-    outlier = np.append(np.zeros(200), 1e9)
-    assert scale.see(outlier) == 3.0
+    assert scale.see(np.append(np.zeros(200), 1e9)) == 3.0  # an outlier
     scale.forget()
     assert scale.top == 1.0
 
@@ -370,16 +326,15 @@ def test_slack_tendon_is_light_and_thin():
     whole = rod("tendon_length")
     tendons = tuple(replace(tendon, unilateral=True) for tendon in whole.segments[0].tendons)
     robot = replace(whole, segments=(replace(whole.segments[0], tendons=tendons),))
-    state = fastrod.Simulator(robot).settle(
-        bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001])
-    )
+    pulled = bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001])
+    state = fastrod.Simulator(robot).settle(pulled)
     slack = state.tension[0] <= 1e-6
     assert slack.any()
     assert not slack.all()
     rods = seen(robot, state)
     picture = Picture(rods)
-    drawn = picture.frame(rods)["tendons"]
-    color, thick = drawn.color.reshape(4, -1, 3), drawn.scale[:, 0].reshape(4, -1)
+    tendons = picture.frame(rods)["tendons"]
+    color, thick = tendons.color.reshape(4, -1, 3), tendons.scale[:, 0].reshape(4, -1)
     assert (color[slack] == palette.SLACK).all()
     assert (color[~slack] == palette.TAUT).all()
     assert thick[slack].max() < thick[~slack].min()
@@ -393,7 +348,7 @@ def test_pushing_rod_is_violet_and_tension_has_two_sides():
     pull, push = int(state.tension[0].argmax()), int(state.tension[0].argmin())
     assert state.tension[0, push] < -0.01
     rods = seen(robot, state)
-    color = Picture(rods).frame(rods)["tendons"].color.reshape(4, -1, 3)
+    color = drawn(rods)["tendons"].color.reshape(4, -1, 3)
     assert (color[push] == palette.PUSHING).all()
     assert (color[pull] == palette.TAUT).all()
     by = Picture(rods, ViewOptions(color_by="tension"))
@@ -405,8 +360,7 @@ def test_pushing_rod_is_violet_and_tension_has_two_sides():
     assert (shown["body"].color == palette.BODY).all()
 
 
-# -- arrows
-# ----------------------------------------------------------------------------------------------------
+# arrows
 
 
 def test_contact_arrow_begins_on_the_wall_and_points_off_it():
@@ -428,32 +382,26 @@ def test_contact_arrow_begins_on_the_wall_and_points_off_it():
     # the wall is free where x < 0.02: off it is -x
     head, shaft = (found[name] for name in ("contact_heads", "contact_shafts"))
     assert_allclose(tangents(head.wxyz[there].astype(float)), [[-1.0, 0.0, 0.0]] * n, atol=1e-6)
-    start, end = ends(
-        shaft._replace(**{name: getattr(shaft, name)[there] for name in ("position", "wxyz", "scale")})
-    )
+    start, end = (each[there] for each in ends(shaft))
     assert_allclose(start, state.contacts.point[0], atol=1e-6)
     assert_allclose(end, head.position[there], atol=1e-6)
-    force = np.linalg.norm(state.contacts.force[0], axis=-1)
-    unit = 0.0022 / 0.07**2
-    assert_allclose(
-        shaft.scale[there, 2] + head.scale[there, 2], 0.3 * 0.07 * force / (force + unit), rtol=1e-5
-    )
+    force, unit = np.linalg.norm(state.contacts.force[0], axis=-1), 0.0022 / 0.07**2
+    size = shaft.scale[there, 2] + head.scale[there, 2]
+    assert_allclose(size, 0.3 * 0.07 * force / (force + unit), rtol=1e-5)
 
 
 def test_load_arrow_is_at_the_tip():
-    robot, _, state = bent("prototype")
-    rods = seen(robot, state)
-    picture = Picture(rods)
-    assert not picture.frame(rods)["load_heads"].scale.any()
-    found = check(picture.frame(rods, tip_force=np.array([0.0, 0.0, -0.2])))
-    assert_allclose(tangents(found["load_shafts"].wxyz.astype(float)), [[0.0, 0.0, -1.0]], atol=1e-6)
-    assert_allclose(ends(found["load_shafts"])[0], state.tip_position, atol=1e-6)
-    assert not picture.frame(rods, tip_force=np.array([np.nan, 0.0, 0.0]))["load_heads"].scale.any()
+    rods, _, state = bent("prototype")
+    for nothing in (None, np.array([np.nan, 0.0, 0.0])):
+        assert not drawn(rods, tip_force=nothing)["load_heads"].scale.any()
+    shafts = drawn(rods, tip_force=np.array([0.0, 0.0, -0.2]))["load_shafts"]
+    assert_allclose(tangents(shafts.wxyz.astype(float)), [[0.0, 0.0, -1.0]], atol=1e-6)
+    assert_allclose(ends(shafts)[0], state.tip_position, atol=1e-6)
 
 
 def test_axes_of_the_tip():
-    robot, _, state = bent("tdcr_a")
-    found = check(Picture(seen(robot, state), ViewOptions(frames=True)).frame(seen(robot, state)))["frames"]
+    rods, _, state = bent("tdcr_a")
+    found = drawn(rods, frames=True)["frames"]
     assert_allclose(tangents(found.wxyz.astype(float)), state.tip_rotation[0].T, atol=1e-5)
     assert_allclose(ends(found)[0], np.broadcast_to(state.tip_position, (3, 3)), atol=1e-5)
     assert_array_equal(found.color, palette.AXES)
@@ -495,8 +443,7 @@ def test_ball_that_is_nowhere_has_no_size():
     assert_allclose(found.scale[:, 0], [0.01, 0.0])
 
 
-# -- meshes, places, words
-# ----------------------------------------------------------------------------------------------------
+# meshes, places, words
 
 
 @pytest.mark.parametrize(
@@ -524,14 +471,14 @@ def test_open_meshes_face_outward(name):
 
 
 def test_meshes_have_the_sizes_they_are_said_to_have():
-    extent = {
-        name: (mesh.vertices.min(0).round(5).tolist(), mesh.vertices.max(0).round(5).tolist())
-        for name, mesh in SHAPES.items()
-    }
+    def extent(name):
+        vertices = SHAPES[name].vertices
+        return vertices.min(0).round(5).tolist(), vertices.max(0).round(5).tolist()
+
     for name in ("tube", "thin_tube", "bar", "disc"):
-        assert extent[name] == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
-    assert extent["ball"] == ([-1.0] * 3, [1.0] * 3)
-    assert extent["cone"] == extent["cap"] == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
+        assert extent(name) == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
+    assert extent("ball") == ([-1.0] * 3, [1.0] * 3)
+    assert extent("cone") == extent("cap") == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 
 
 def test_grid_is_square_and_centred():
@@ -544,44 +491,38 @@ def test_grid_is_square_and_centred():
 
 
 def test_bounds_hold_the_robots():
-    robot, _, state = bent("five_segment_reacher", n_robots=5)
     place = grid_places(5, 0.7)
-    centre, radius = bounds(seen(robot, state, place))
+    rods, _, state = bent("five_segment_reacher", n_robots=5, place=place)
+    centre, radius = bounds(rods)
     away = np.linalg.norm(state.position + place[:, None] - centre, axis=-1)
     assert away.max() < radius < 3.0
-    alone = seen(robot, replace(state, position=np.full_like(state.position, np.nan)), place)
-    assert_allclose(bounds(alone)[0], [0.0, 0.0, 0.25], atol=1e-12)  # lost robots count as straight ones
-    one, _, state = bent("tdcr_a")
-    assert bounds(seen(one, state))[1] == pytest.approx(0.62 * 0.4)  # room to bend to both sides
-    cube = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
-    far, wide = (
-        np.array([[0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]),
-        Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0)),
-    )
+    nowhere = seen(rods.robots, replace(state, position=np.full_like(state.position, np.nan)), place)
+    assert_allclose(bounds(nowhere)[0], [0.0, 0.0, 0.25], atol=1e-12)  # lost robots count as straight ones
+    one = bent("tdcr_a")[0]
+    assert bounds(one)[1] == pytest.approx(0.62 * 0.4)  # room to bend to both sides
+    cube, far = np.array([[-1.0] * 3, [1.0] * 3], np.float32), np.array([[0.4, 0, 0, 1, 0, 0, 0]], float)
+    wide = Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0))
     near = wide._replace(name="box", vertices=0.05 * cube)
     # a floor is no reason to step back
-    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.4)
-    centre, radius = bounds(seen(one, state), [near], far)
+    assert bounds(one, [wide], far)[1] == pytest.approx(0.62 * 0.4)
+    centre, radius = bounds(one, [near], far)
     corners = np.array([[0.45, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
     assert (np.linalg.norm(corners - centre, axis=1) <= radius + 1e-12).all()
 
 
 @pytest.mark.parametrize("color_by", ["segment", "curvature", "strain", "tension"])
 def test_legend_says_what_colours_mean(color_by):
-    robot, _, state = bent("tdcr_a")
-    options = ViewOptions(color_by=color_by)
-    picture = Picture(seen(robot, state), options)
-    picture.frame(seen(robot, state))
-    found = legend(seen(robot, state), options, picture)
+    rods, options = bent("tdcr_a")[0], ViewOptions(color_by=color_by)
+    picture = Picture(rods, options)
+    picture.frame(rods)
+    found = legend(rods, options, picture)
     html = found.html()
-    assert html.count("<div") == html.count("</div>")
-    assert html.count("<span") == html.count("</span>")
+    for tag in ("div", "span"):
+        assert html.count(f"<{tag}") == html.count(f"</{tag}>")
     assert "class=" not in html
     if color_by == "segment":
-        assert [(entry.name, entry.color) for entry in found.entries] == [
-            ("Segment 1", palette.SEGMENTS[0]),
-            ("Segment 2", palette.SEGMENTS[1]),
-        ]
+        entries = [(f"Segment {k}", color) for k, color in enumerate(palette.SEGMENTS[:2], 1)]
+        assert [(entry.name, entry.color) for entry in found.entries] == entries
         assert "Segment 2" in html
     else:
         assert found.ticks[-1].value == picture.range.top
@@ -598,11 +539,8 @@ def test_bad_option_is_one_sentence():
         ViewOptions(body="skins")
     with pytest.raises(InputError, match=r"^ViewOptions.tendons is 1; it must be True or False\.$"):
         ViewOptions(tendons=1)
-    with pytest.raises(
-        InputError,
-        match=r"^ViewOptions.pieces is 0; it must be a whole number, at least 1, or "
-        r"None\.$",
-    ):
+    sentence = r"^ViewOptions.pieces is 0; it must be a whole number, at least 1, or None\.$"
+    with pytest.raises(InputError, match=sentence):
         ViewOptions(pieces=0)
 
 

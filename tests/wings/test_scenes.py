@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.contact import mesh
 from fastrod.errors import UnknownNameError
@@ -36,7 +37,7 @@ def test_run_is_ok_from_the_first_input_to_the_last(name):
     times, states = zip(*scene.run(), strict=True)
     assert times[0] == 0.0
     assert times[-1] == pytest.approx(scene.duration)
-    np.testing.assert_allclose(np.diff(times), scene.dt)
+    assert_allclose(np.diff(times), scene.dt)
     assert all(state.ok.all() for state in states)
     assert states[-1].contacts.count.all()
     assert not states[0].contacts.count.any()
@@ -45,7 +46,7 @@ def test_run_is_ok_from_the_first_input_to_the_last(name):
 def test_runs_of_one_scene_are_the_same():
     scene = load("draped")
     (*_, (_, first)), (*_, (_, second)) = scene.run(), scene.run()
-    np.testing.assert_array_equal(first.position, second.position)
+    assert_array_equal(first.position, second.position)
 
 
 def test_unknown_scene_answers_with_the_nearest():
@@ -80,12 +81,10 @@ def test_airway_is_a_watertight_wall_with_two_handles():
 
 def test_airway_stands_where_the_distance_says():
     vertices, _ = airway_mesh.airway()
-    ends = [
-        airway_mesh.middle(branch, np.array([airway_mesh.path_length()])) for branch in airway_mesh.BRANCHES
-    ]
-    cut = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0) < 2.0 * (
-        airway_mesh.RADIUS + airway_mesh.WALL
-    )
+    depth = np.array([airway_mesh.path_length()])
+    ends = [airway_mesh.middle(branch, depth) for branch in airway_mesh.BRANCHES]
+    apart = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0)
+    cut = apart < 2.0 * (airway_mesh.RADIUS + airway_mesh.WALL)
     distance = airway_mesh.lumen_distance(vertices[~cut & (vertices[:, 2] > 0.004)])
     inner = distance < airway_mesh.WALL / 2.0
     assert inner.sum() > 1000
@@ -98,20 +97,19 @@ def test_airway_stands_where_the_distance_says():
 def test_airway_is_open_at_its_three_ends():
     depth = np.linspace(-0.02, airway_mesh.path_length() + 0.02, 60)
     for branch in airway_mesh.BRANCHES:
-        assert (
-            airway_mesh.lumen_distance(airway_mesh.middle(branch, depth)) < -0.9 * airway_mesh.RADIUS
-        ).all()
+        distance = airway_mesh.lumen_distance(airway_mesh.middle(branch, depth))
+        assert (distance < -0.9 * airway_mesh.RADIUS).all()
 
 
 def test_middle_of_the_airway_is_as_long_as_its_depth_and_bends_as_it_heads():
     depth = np.linspace(0.0, airway_mesh.path_length(), 4001)
     for branch, toward in airway_mesh.BRANCHES.items():
         step = np.diff(airway_mesh.middle(branch, depth), axis=0)
-        np.testing.assert_allclose(np.linalg.norm(step, axis=1), np.diff(depth), rtol=1e-6)
+        assert_allclose(np.linalg.norm(step, axis=1), np.diff(depth), rtol=1e-6)
         for k in (500, 2000, 3900):
             angle = airway_mesh.heading(0.5 * (depth[k] + depth[k + 1]))
             direction = [np.sin(angle) * np.cos(toward), np.sin(angle) * np.sin(toward), np.cos(angle)]
-            np.testing.assert_allclose(step[k] / np.diff(depth)[k], direction, atol=1e-5)
+            assert_allclose(step[k] / np.diff(depth)[k], direction, atol=1e-5)
 
 
 def test_surface_of_a_ball():

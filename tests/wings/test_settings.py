@@ -1,11 +1,7 @@
-"""What `fastrod train --set` takes: the settings of an algorithm, answered with the nearest name before
-anything is made."""
-
-from __future__ import annotations
+"""What `fastrod train --set` takes: an algorithm's settings, checked before anything is made."""
 
 import inspect
 import re
-from pathlib import Path
 
 import pytest
 
@@ -36,14 +32,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("algorithm", "pair", "sentence"), WRONG)
-def test_a_setting_that_cannot_be_is_a_sentence(
-    algorithm: str,
-    pair: str,
-    sentence: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_setting_that_cannot_be_is_a_sentence(algorithm, pair, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["train", "Reach", "--algo", algorithm, "--set", pair]) == 2
     said = capsys.readouterr().err

@@ -1,7 +1,4 @@
-"""The paper's class on fastrod's model: every method, and the faults of the paper's own code that it must not
-have."""
-
-from __future__ import annotations
+"""The paper's class on fastrod's model: every method, without the faults of the paper's own code."""
 
 import logging
 import math
@@ -47,12 +44,9 @@ def make() -> Iterator[Callable[..., SoftManiSim]]:
         world.disconnect()
 
 
-def poses(b: Bullet) -> dict[int, list[float]]:
+def poses(b: Bullet) -> dict[int, Any]:
     bodies = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
-    return {
-        i: [*np.concatenate(b.getBasePositionAndOrientation(i)), *np.concatenate(b.getBaseVelocity(i))]
-        for i in bodies
-    }
+    return {i: np.concatenate([*b.getBasePositionAndOrientation(i), *b.getBaseVelocity(i)]) for i in bodies}
 
 
 def place_of(sim: SoftManiSim, body: int) -> np.ndarray[Any, Any]:
@@ -63,18 +57,15 @@ def speed_of(sim: SoftManiSim, body: int) -> np.ndarray[Any, Any]:
     return np.array(sim.bullet.getBaseVelocity(body)[0])
 
 
-def axis(quaternion: Any, k: int) -> np.ndarray[Any, Any]:
-    return np.array(
-        [np.reshape(pybullet.getMatrixFromQuaternion(q), (3, 3))[:, k] for q in np.atleast_2d(quaternion)]
-    )
+def tangents(quaternions: Any) -> np.ndarray[Any, Any]:
+    """Third axes of quaternions x y z w."""
+    return np.array([pybullet.getMatrixFromQuaternion(q)[2::3] for q in quaternions])
 
 
 # shape
 
 
-def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(
-    make: Callable[..., SoftManiSim],
-) -> None:
+def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make):
     sim = make(number_of_segment=1)
     world, own = sim.move_robot_ori()
     assert world.shape == own.shape == (30, 7)
@@ -86,28 +77,26 @@ def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(
     assert_allclose(sim.calc_tip_pos([0.05, 0, 0])[0], [0, 0.15, 0], atol=1e-6)
 
 
-def test_orientations_are_those_of_the_backbone(make: Callable[..., SoftManiSim]) -> None:
-    """z of each quaternion is the tangent, to the order of central differences; the whole bend is
-    displacement over offset."""
+def test_orientations_are_those_of_the_backbone(make):
+    """z of each quaternion is the tangent, by central differences; the bend is displacement over offset."""
     sim = make(number_of_sphere=200)
     rng = np.random.default_rng(3)
     for _ in range(3):
         action = np.c_[rng.uniform(-0.02, 0.05, 3), rng.uniform(-0.006, 0.006, (3, 2))]
         world, _ = sim.move_robot_ori(action.ravel(), [0.1, 0.2, 0.3], rng.uniform(-2, 2, 3))
         s = np.linspace(0.0, 0.3 + action[:, 0].sum(), 200)
-        assert_allclose(
-            axis(world[1:-1, 3:], 2), (world[2:, :3] - world[:-2, :3]) / (s[2:] - s[:-2])[:, None], atol=0.03
-        )
+        slopes = (world[2:, :3] - world[:-2, :3]) / (s[2:] - s[:-2])[:, None]
+        assert_allclose(tangents(world[1:-1, 3:]), slopes, atol=0.03)
         # the last points inside each segment: less than its bend by their share
         for k, end in enumerate(np.cumsum(0.1 + action[:, 0])):
             inside = (s >= end - 0.1 - action[k, 0]) & (s <= end)
-            first, last = axis(world[inside][[0, -1], 3:], 2)
+            first, last = tangents(world[inside][[0, -1], 3:])
             fraction = np.ptp(s[inside]) / (0.1 + action[k, 0])
             bend = math.acos(np.clip(first @ last, -1, 1))
             assert bend == pytest.approx(fraction * np.hypot(*action[k, 1:]) / OFFSET, abs=1e-4)
 
 
-def test_world_is_base_times_robot_and_the_base_rotates_it(make: Callable[..., SoftManiSim]) -> None:
+def test_world_is_base_times_robot_and_the_base_rotates_it(make):
     sim = make()
     action, base, angles = [0.01, 0.003, -0.002] * 3, [0.3, -0.2, 0.5], [0.4, -0.7, 1.9]
     rotation = pybullet.getQuaternionFromEuler(angles)
@@ -122,7 +111,7 @@ def test_world_is_base_times_robot_and_the_base_rotates_it(make: Callable[..., S
     assert_allclose(sim.calc_tip_pos(None, (0, 0, 1), DOWN)[0], [0, 0, 0.7], atol=1e-9)
 
 
-def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make: Callable[..., SoftManiSim]) -> None:
+def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make):
     sim, twin = make(), make()
     cube = sim.add_a_cube([0, 0.8, 0.3])
     for s in (sim, twin):
@@ -141,7 +130,7 @@ def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make: Callable[..
 # bodies
 
 
-def test_bodies_are_replaced_and_taken_away(make: Callable[..., SoftManiSim]) -> None:
+def test_bodies_are_replaced_and_taken_away(make):
     sim = make(dt=0.005, number_of_sphere=10)
     count = sim.bullet.getNumBodies()
     assert count == 10  # nine capsules, and the head with its fingers
@@ -163,7 +152,7 @@ def test_a_world_of_its_own_ends_with_it() -> None:
     assert not sim.bullet.isConnected()
 
 
-def test_robots_and_worlds_do_not_disturb_each_other(make: Callable[..., SoftManiSim]) -> None:
+def test_robots_and_worlds_do_not_disturb_each_other(make):
     alone, here, there = make(), make(), make()
     beside = SoftManiSim(here.bullet, number_of_segment=1)  # a second robot in the same world
     ends = []
@@ -182,7 +171,7 @@ def test_robots_and_worlds_do_not_disturb_each_other(make: Callable[..., SoftMan
     assert len(poses(here.bullet)) == len(poses(there.bullet)) + 31
 
 
-def test_the_marker_is_only_seen(make: Callable[..., SoftManiSim]) -> None:
+def test_the_marker_is_only_seen(make):
     sim = make(dt=0.005)
     cube = sim.add_a_cube([0, 0.4, 1.0], size=[0.02] * 3, mass=0.0)
     known = set(poses(sim.bullet))
@@ -199,9 +188,8 @@ def test_the_marker_is_only_seen(make: Callable[..., SoftManiSim]) -> None:
 
 
 @pytest.mark.parametrize("dt", STEPS)
-def test_a_cube_takes_the_speed_of_what_pushes_it(make: Callable[..., SoftManiSim], dt: float) -> None:
-    """In the step of the first contact the head may be one step's way inside: the engine takes out a fifth of
-    it a step, as speed."""
+def test_a_cube_takes_the_speed_of_what_pushes_it(make, dt):
+    """The head may begin one step's way inside: the engine takes out a fifth of it a step, as speed."""
     sim = make(dt=dt, gravity=0.0, max_grasp_width=0.0)
     cube = sim.add_a_cube([0, 0.3 + 0.0225 + 0.02 + 0.01, 0], size=[0.04] * 3)
     seen = []
@@ -215,7 +203,7 @@ def test_a_cube_takes_the_speed_of_what_pushes_it(make: Callable[..., SoftManiSi
 
 
 @pytest.mark.parametrize("dt", STEPS)
-def test_a_swinging_head_pushes_at_its_speed(make: Callable[..., SoftManiSim], dt: float) -> None:
+def test_a_swinging_head_pushes_at_its_speed(make, dt):
     sim = make(dt=dt, gravity=0.0, max_grasp_width=0.0)
     cube = sim.add_a_cube([0.06, 0.3, 0], size=[0.04] * 3)
     tips, cubes = [], []
@@ -230,7 +218,7 @@ def test_a_swinging_head_pushes_at_its_speed(make: Callable[..., SoftManiSim], d
 
 
 @pytest.mark.parametrize("dt", STEPS)
-def test_a_jump_of_the_action_launches_nothing(make: Callable[..., SoftManiSim], dt: float) -> None:
+def test_a_jump_of_the_action_launches_nothing(make, dt):
     sim = make(dt=dt, gravity=0.0, number_of_sphere=16)
     cube = sim.add_a_cube([0.09, 0.25, 0], size=[0.05] * 3)
     sim.move_robot_ori()
@@ -242,7 +230,7 @@ def test_a_jump_of_the_action_launches_nothing(make: Callable[..., SoftManiSim],
     assert np.linalg.norm(speed_of(sim, cube)) < 1.2 * 2.0
 
 
-def test_the_first_placement_passes_through_nothing(make: Callable[..., SoftManiSim]) -> None:
+def test_the_first_placement_passes_through_nothing(make):
     sim = make(dt=0.005, gravity=0.0)
     cube = sim.add_a_cube([0, 0.2, 0], size=[0.05] * 3)  # where the robot stands before its first motion
     sim.wait(0.1)
@@ -255,7 +243,7 @@ def test_the_first_placement_passes_through_nothing(make: Callable[..., SoftMani
 # contact
 
 
-def test_contact_is_of_surfaces_not_of_boxes(make: Callable[..., SoftManiSim]) -> None:
+def test_contact_is_of_surfaces_not_of_boxes(make):
     sim = make(dt=0.005, gravity=0.0)
     # along x = y: the corners of its bounding box are empty
     sim.move_robot_ori(base_orin=[0, 0, -math.pi / 4])
@@ -271,7 +259,7 @@ def test_contact_is_of_surfaces_not_of_boxes(make: Callable[..., SoftManiSim]) -
     assert not sim.is_tip_in_contact(on)
 
 
-def test_a_tilted_cube_near_the_tip_makes_no_contact(make: Callable[..., SoftManiSim]) -> None:
+def test_a_tilted_cube_near_the_tip_makes_no_contact(make):
     sim = make(dt=0.005, gravity=0.0, max_grasp_width=0.0)
     sim.move_robot_ori()
     side, tilt = 0.1, math.pi / 4
@@ -290,9 +278,7 @@ def test_a_tilted_cube_near_the_tip_makes_no_contact(make: Callable[..., SoftMan
 # grasping
 
 
-def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(
-    make: Callable[..., SoftManiSim], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(make, caplog):
     sim = make(max_grasp_width=0.0)
     cube = sim.add_a_cube([0.005, 0, 0.03], ori=about_z(0.3), size=[0.06] * 3, mass=0.5)
     sim.wait(0.1)
@@ -330,7 +316,7 @@ def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(
 
 
 @pytest.mark.parametrize("dt", STEPS)
-def test_the_gripper_holds_what_it_closes_on(make: Callable[..., SoftManiSim], dt: float) -> None:
+def test_the_gripper_holds_what_it_closes_on(make, dt):
     """A cube of 3 cm and 100 g, not quite in the middle: lifted by 10 cm, held for a second, and dropped."""
     sim = make(dt=dt, number_of_sphere=8)
     sim.add_a_cube([0, 0, -0.05], size=[1, 1, 0.1], mass=0.0)  # the ground
@@ -356,7 +342,7 @@ def test_the_gripper_holds_what_it_closes_on(make: Callable[..., SoftManiSim], d
 # cubes and time
 
 
-def test_a_cube_stands_as_given_and_falls_without_damping(make: Callable[..., SoftManiSim]) -> None:
+def test_a_cube_stands_as_given_and_falls_without_damping(make):
     sim = make(dt=0.002)
     rotation = np.array([0.1, -0.4, 0.2, 0.8]) / np.linalg.norm([0.1, -0.4, 0.2, 0.8])
     cube = sim.add_a_cube([1, 2, 3], rotation, [0.02, 0.04, 0.06], 0.3, [0, 1, 0, 1])
@@ -372,24 +358,19 @@ def test_a_cube_stands_as_given_and_falls_without_damping(make: Callable[..., So
 # pictures
 
 
-def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) -> None:
+def test_pictures_have_true_colours_and_depth(make):
     sim = make(max_grasp_width=0.0)
-    sim.camera, sim.in_hand_camera = (
-        HostCamera(width=64, height=48),
-        HostCamera(width=64, height=48, near=0.005, far=3.0),
-    )
+    sim.camera = HostCamera(width=64, height=48)
+    sim.in_hand_camera = HostCamera(width=64, height=48, near=0.005, far=3.0)
     red = sim.add_a_cube([0, 0.5, 0.3], size=[0.1] * 3, color=[1, 0, 0, 1], mass=0.0)
     sim.move_robot_ori(base_pos=[0, 0, 0.3])
-    rgb, depth = sim.in_hand_camera_capture_image()
-    assert rgb[24, 32, 0] > 100
-    assert rgb[24, 32, 1:].max() < 30
-    # from the front of the head, 23.5 mm beyond the tip
-    assert depth[24, 32] == pytest.approx(0.15 - 0.0235, abs=1e-3)
     sim.view = CameraView((0.6, 0.5, 0.3), (0, 0.5, 0.3))
-    rgb, depth = sim.capture_image()
-    assert rgb[24, 32, 0] > 100
-    assert rgb[24, 32, 1:].max() < 30
-    assert depth[24, 32] == pytest.approx(0.55, abs=1e-3)
+    # the one in the hand sees from the front of the head, 23.5 mm beyond the tip
+    for look, distance in ((sim.in_hand_camera_capture_image, 0.15 - 0.0235), (sim.capture_image, 0.55)):
+        rgb, depth = look()
+        assert rgb[24, 32, 0] > 100
+        assert rgb[24, 32, 1:].max() < 30
+        assert depth[24, 32] == pytest.approx(distance, abs=1e-3)
     seen = sim.camera.look(sim.bullet, *sim.view).segmentation
     assert sim.plane_id in seen
     bare, far = sim.capture_image(removeBackground=True)
@@ -401,7 +382,7 @@ def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) 
     assert_array_equal(far[~gone], depth[~gone])
 
 
-def test_the_camera_in_the_head_rolls_with_the_robot(make: Callable[..., SoftManiSim]) -> None:
+def test_the_camera_in_the_head_rolls_with_the_robot(make):
     sim = make(max_grasp_width=0.0)
     sim.in_hand_camera = HostCamera(width=64, height=48, near=0.005, far=3.0)
     # up and right of the tip

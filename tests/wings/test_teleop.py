@@ -1,12 +1,12 @@
 """Goals become motion within limits; sessions run, stop and record; all without a browser."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pages import until
 
 import fastrod
 from fastrod.errors import InputError
@@ -28,11 +28,17 @@ def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Teleop]:
     return world, Teleop(world)
 
 
-def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
-    end = time.monotonic() + seconds
-    while not holds() and time.monotonic() < end:
-        time.sleep(0.01)
-    return holds()
+def begun(world: FreeWorld, teleop: Teleop, draw: Any = lambda frame: None, **options: Any) -> Session:
+    """A session that runs."""
+    session = Session(world, teleop, draw=draw, **options)
+    session.start()
+    return session
+
+
+def bent(teleop: Teleop, session: Session, x: float, y: float = 0.0) -> None:
+    """Segment 1 is commanded to bend."""
+    teleop.bend(0, x, y)
+    session.wake()
 
 
 def test_a_bend_arrives_at_its_speed_and_bends_an_arc() -> None:
@@ -41,14 +47,14 @@ def test_a_bend_arrives_at_its_speed_and_bends_an_arc() -> None:
     teleop.bend(0, 0.5, 0.0)
     before = teleop.step(0.1).tendon_length
     # 0.1 rad of the 0.5 in a tenth of a second, times the tendons' 7.5 mm
-    np.testing.assert_allclose(before - 0.07, [-0.00075, 0.0, 0.00075, 0.0], atol=1e-12)
+    assert_allclose(before - 0.07, [-0.00075, 0.0, 0.00075, 0.0], atol=1e-12)
     for _ in range(30):
         world.drive(teleop.step(DT))
     assert teleop.arrived
     length, angle = 0.07, 0.5
     tip = world.rods[0].state.tip_position[0]
     arc = length / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
-    np.testing.assert_allclose(tip, arc, atol=3e-4)  # the tendons stretch by 1e-5 m/N
+    assert_allclose(tip, arc, atol=3e-4)  # the tendons stretch by 1e-5 m/N
 
 
 def test_bends_and_extensions_stay_within_their_ranges() -> None:
@@ -93,7 +99,7 @@ def test_one_tendon_moves_alone() -> None:
     teleop.change_tendon(4, -0.002)
     expected = before.copy()
     expected[4] = -0.002
-    np.testing.assert_allclose(teleop.change, expected, atol=1e-15)
+    assert_allclose(teleop.change, expected, atol=1e-15)
     assert teleop.bent(0) == pytest.approx((0.3, 0.1))
 
 
@@ -106,16 +112,14 @@ def test_taking_over_moves_nothing() -> None:
     teleop.adopt(now.dl, now.ext)
     for _ in range(3):
         world.drive(teleop.step(DT))
-    np.testing.assert_allclose(world.rods[0].state.tip_position[0], tip, atol=1e-5)
+    assert_allclose(world.rods[0].state.tip_position[0], tip, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", fastrod.robot_names())
 def test_every_control_reads_what_it_was_put_to(name: str) -> None:
     world, teleop = piloted(name)
-    controls = [control for group in drive_controls(world, teleop) for control in group.controls] + list(
-        load_controls(world.robot, teleop).controls
-    )
-    for control in controls:
+    groups = (*drive_controls(world, teleop), load_controls(world.robot, teleop))
+    for control in (control for group in groups for control in group.controls):
         assert control.low < control.high
         assert control.label.endswith("]")
         wanted = control.low + 0.7 * (control.high - control.low)
@@ -140,21 +144,18 @@ def test_speeds_are_positive() -> None:
 def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
     world, teleop = piloted("prototype")
     drawn: list[float] = []
-    session = Session(world, teleop, draw=lambda frame: drawn.append(frame.world.t))
-    session.start()
+    session = begun(world, teleop, lambda frame: drawn.append(frame.world.t))
     teleop.speeds = Speeds(bend=0.2)
     session.take_over()
-    teleop.bend(0, 1.0, 0.0)
-    session.wake()
+    bent(teleop, session, 1.0)
     assert until(lambda: teleop.now.action[1] > 1e-4)
     session.stop()
     there = teleop.now.action.copy()
     time.sleep(0.2)
-    np.testing.assert_array_equal(teleop.now.action, there)
+    assert_array_equal(teleop.now.action, there)
     assert there[1] < 0.9 * 0.0075
     session.release()
-    teleop.bend(0, 0.0, 0.0)
-    session.wake()
+    bent(teleop, session, 0.0)
     assert until(lambda: teleop.arrived)
     session.close()
     assert len(drawn) > 5
@@ -172,10 +173,8 @@ def test_what_cannot_be_done_is_said_and_given_up(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(FreeWorld, "drive", refuse)
     problems: list[str] = []
-    session = Session(world, teleop, draw=lambda frame: problems.append(frame.problem))
-    session.start()
-    teleop.bend(0, 1.0, 0.0)
-    session.wake()
+    session = begun(world, teleop, lambda frame: problems.append(frame.problem))
+    bent(teleop, session, 1.0)
     assert until(lambda: "robot 0 cannot be brought there: a wall." in problems)
     assert until(lambda: teleop.arrived)
     assert teleop.bent(0)[0] < 0.5
@@ -206,10 +205,8 @@ def test_a_real_robot_stops_when_nobody_watches_and_a_simulated_one_holds() -> N
         assert isinstance(link, RobotLink)
         world = FreeWorld(robot)
         teleop = Teleop(world, Speeds(bend=0.1))
-        session = Session(world, teleop, draw=lambda frame: None, link=link)
-        session.start()
-        teleop.bend(0, 1.0, 0.0)
-        session.wake()
+        session = begun(world, teleop, link=link)
+        bent(teleop, session, 1.0)
         assert until(lambda link=link: bool(link.read().dl[0] < -1e-5))
         session.nobody()
         there = teleop.now.action[1]
@@ -239,10 +236,9 @@ def test_a_linked_robot_is_taken_over_where_it_stands_and_never_jumps() -> None:
 
     world = FreeWorld(robot)
     teleop = Teleop(world, Speeds(bend=0.5))
-    session = Session(world, teleop, draw=lambda frame: None, link=Heard())
-    session.start()
+    session = begun(world, teleop, link=Heard())
     assert until(lambda: len(held) > 3)
-    np.testing.assert_allclose(held[0], [-0.006, 0.0, 0.006, 0.0], atol=1e-9)
+    assert_allclose(held[0], [-0.006, 0.0, 0.006, 0.0], atol=1e-9)
     session.reset()
     assert until(lambda: bool(np.abs(held[-1]).max() < 1e-9))
     session.stop()
@@ -279,22 +275,17 @@ def test_a_measured_robot_that_differs_shows_its_residual() -> None:
     robot = fastrod.load_robot("prototype")
     world = FreeWorld(robot)
     teleop = Teleop(world)
-    seen: list[Measurement | None] = []
-    session = Session(
-        world, teleop, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot)
-    )
+    seen: list[Any] = []
+    link = SimulatedRobot(robot)
+    session = Session(world, teleop, draw=lambda frame: seen.append(frame.measured), link=link)
     recorder = Recorder(robot)
     recorder.start(0.0, "by hand")
     session.recorder = recorder
     session.start()
-    teleop.bend(0, 0.5, 0.0)
-    session.wake()
+    bent(teleop, session, 0.5)
     assert until(lambda: teleop.arrived and len(seen) > 20)
     session.close()
-    last = seen[-1]
-    assert last is not None
-    state = world.rods[0].state
-    np.testing.assert_allclose(last.tip_position, state.tip_position[0], atol=1e-6)
+    assert_allclose(seen[-1].tip_position, world.rods[0].state.tip_position[0], atol=1e-6)
     assert len(recorder) > 10
 
 
@@ -307,21 +298,15 @@ def test_a_simulated_robot_refuses_what_it_cannot_do() -> None:
     link.command([-0.004, 0.0, 0.004, 0.0])
     link.stop()
     link.command([0.0, 0.0, 0.0, 0.0])
-    np.testing.assert_array_equal(link.read().dl, [-0.004, 0.0, 0.004, 0.0])
+    assert_array_equal(link.read().dl, [-0.004, 0.0, 0.004, 0.0])
     link.release()
     link.command([0.0, 0.0, 0.0, 0.0])
     assert not link.read().dl.any()
 
 
 def test_a_measurement_has_the_shapes_of_a_log() -> None:
-    good = {
-        "t": 0.0,
-        "dl": np.zeros(4),
-        "ext": np.zeros(1),
-        "tip_position": np.zeros(3),
-        "tip_quaternion": [1, 0, 0, 0],
-        "tension": np.zeros(4),
-    }
+    good = {"t": 0.0, "dl": np.zeros(4), "ext": np.zeros(1), "tension": np.zeros(4)}
+    good |= {"tip_position": np.zeros(3), "tip_quaternion": [1, 0, 0, 0]}
     assert Measurement(**good).problem == ""
     with pytest.raises(InputError, match=r"Measurement.tip_position has shape \(2,\); it must be \(3,\)"):
         Measurement(**(good | {"tip_position": np.zeros(2)}))

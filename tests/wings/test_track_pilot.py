@@ -44,7 +44,7 @@ def policy() -> Policy:
 
 
 def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str, Any]:
-    """An episode of the environment: where it began, what was told, what came of it."""
+    """An episode of the environment: where it began, what was commanded, what came of it."""
     options: dict[str, Any] = {} if robot is PROTOTYPE else {"randomise": Randomisation(robot=robot)}
     env = SingleEnv("Track", path=path, n_steps=n_steps, **options)
     observation, _ = env.reset(seed=seed)
@@ -98,11 +98,11 @@ def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -
 
 
 def test_both_ways_round_were_seen() -> None:
-    ways = {
-        episode(path, seed, PROTOTYPE, n_steps=1)["way"]
+    senses = {
+        episode(path, seed, PROTOTYPE, n_steps=1)["sense"]
         for path, seed in (("triangle", 1), ("square", 2), ("circle", 4))
     }
-    assert ways == {-1, 1}
+    assert senses == {-1, 1}
 
 
 def test_a_simulated_robot_is_led_along_the_path() -> None:
@@ -150,19 +150,19 @@ def test_a_dropout_is_the_last_known_tip_for_one_step_and_then_a_halt() -> None:
     known = np.array([0.002, -0.001, 0.069])
     lost = np.full(3, np.nan)
 
-    def told(*tips: Floats) -> list[Floats]:
+    def reported(*tips: Floats) -> list[Floats]:
         pilot = PolicyDriver(policy(), "circle")
         return [pilot.command(tip, DT * k) for k, tip in enumerate(tips)]
 
-    held = told(known, known, known)
-    seen = told(known, known, lost, lost, lost, known)
+    held = reported(known, known, known)
+    seen = reported(known, known, lost, lost, lost, known)
     assert_array_equal(seen[:3], held)
     assert np.abs(seen[2] - seen[1]).max() > 0.0
     assert_array_equal(seen[3], seen[2])
     assert_array_equal(seen[4], seen[2])
     assert np.abs(seen[5] - seen[4]).max() > 0.0
-    assert_array_equal(told(known, np.array([0.002, np.nan, 0.069]))[1], held[1])
-    late = told(lost, lost, known, known)
+    assert_array_equal(reported(known, np.array([0.002, np.nan, 0.069]))[1], held[1])
+    late = reported(lost, lost, known, known)
     assert_array_equal(late[:2], np.zeros((2, 4)))
     assert np.abs(late[2]).max() > 0.0
 
@@ -171,7 +171,7 @@ def test_commands_stay_within_the_tasks_limits() -> None:
     pilot = PolicyDriver(policy(), "circle")
     stuck = np.array([0.0, 0.0, PROTOTYPE.length])
     dl = np.array([pilot.command(stuck, DT * k) for k in range(400)])
-    # the angles of the wires have twelve digits
+    # the angles of the tendons have twelve digits
     assert np.abs(dl).max() == pytest.approx(0.008, abs=1e-13)
     assert np.abs(np.diff(dl, axis=0)).max() <= 0.01 * DT + 1e-13
     assert_allclose(np.abs(pilot.displacement), np.abs(dl[-1, :2]), atol=1e-13)

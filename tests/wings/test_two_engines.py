@@ -1,7 +1,5 @@
 """The same UR5 carries the same rod in PyBullet and in MuJoCo: what both engines find agrees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from two_engines import CASES, apart, at_rest, carried

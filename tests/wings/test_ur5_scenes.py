@@ -1,7 +1,6 @@
-"""The box that a soft robot explores, and the fork that carries two: what the scenes' own checks leave
-open."""
+"""The box that a soft robot explores, and the fork that carries two: what the scenes' checks leave open."""
 
-from __future__ import annotations
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -26,16 +25,12 @@ def test_corners_are_eight_and_their_cubes_lie_in_them() -> None:
     assert len({tuple(c) for c in corners.round(9)}) == len(set(CORNERS)) == len(set(COLORS)) == 8
     for k, corner in enumerate(corners):
         assert_allclose(np.abs(box.cube_at(k) - corner), 0.5 * box.cube)
-        assert_allclose(
-            box.off_cube(k, np.array([corner, box.cube_at(k), corner + np.array([0.0, 0.0, 0.01])]))[:2],
-            [0.0, 0.5 * box.cube],
-            atol=1e-15,
-        )
+        points = np.array([corner, box.cube_at(k), corner + np.array([0.0, 0.0, 0.01])])
+        assert_allclose(box.off_cube(k, points)[:2], [0.0, 0.5 * box.cube], atol=1e-15)
 
 
 def test_walls_leave_the_entry_open_and_nothing_else() -> None:
-    """Rays along x at the front wall: those within the octagon pass, those outside do not; a box without an
-    entry stops all."""
+    """Rays along x at the front wall pass within the octagon alone; a box without an entry stops all."""
     at = np.random.default_rng(30).uniform(-0.09, 0.09, (400, 2))
     turned = np.abs(np.concatenate([at, (at @ [[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2.0)], axis=1)).max(axis=1)
     for box in (Box(), Box(entry=0.0)):
@@ -89,17 +84,10 @@ def test_eased_rests_at_both_ends() -> None:
 
 
 def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
-    world = connect()
+    world, zero, top = connect(), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
     host = BulletLink(world, world.createMultiBody(1.0, -1, -1, [0.1, 0.2, 0.3]))
-    bracket = Bracket(
-        host,
-        [
-            ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
-            ((0.0, 0.0, 0.1), (0.0, 0.0, 0.05)),
-            ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)),
-        ],
-        0.01,
-    )
+    bars = [(zero, top), (top, (0.0, 0.0, 0.05)), (zero, (0.1, 0.0, 0.0))]
+    bracket = Bracket(host, bars, 0.01)
     world.resetBasePositionAndOrientation(host.body, [0.4, 0.5, 0.6], [0.0, 0.0, 1.0, 0.0])
     bracket.follow()
     position, quaternion = world.getBasePositionAndOrientation(bracket.body)
@@ -111,8 +99,8 @@ def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed: int) -> None:
-    stage = Exploration(Box(), seed, Explore.dt)
+def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed, opened):
+    stage = opened(Exploration(Box(), seed, Explore.dt))
     q, step = stage.q, 0.0
     times = np.linspace(0.0, INSIDE, 51)
     for t in times:
@@ -124,20 +112,16 @@ def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed: int)
     assert_allclose(stage.flange(OUT), stage.flange(INSIDE))
     base = stage.flange(APPROACH)
     assert np.hypot(*(base[1:3] - [0.0, stage.box.height])) < 0.02
-    stage.close()
 
 
-def test_starts_differ() -> None:
-    starts = []
-    for seed in range(4):
-        stage = Exploration(Box(), seed, Explore.dt)
-        starts.append(np.concatenate([stage.q, stage.action, stage.entry]))
-        stage.close()
-    assert min(np.abs(a - b).max() for i, a in enumerate(starts) for b in starts[:i]) > 0.05
+def test_starts_differ(opened):
+    stages = [opened(Exploration(Box(), seed, Explore.dt)) for seed in range(4)]
+    starts = [np.concatenate([stage.q, stage.action, stage.entry]) for stage in stages]
+    assert min(np.abs(a - b).max() for a, b in combinations(starts, 2)) > 0.05
 
 
-def test_held_joints_stay_while_the_soft_robot_looks_around() -> None:
-    stage = Exploration(Box(), 3, Explore.dt)
+def test_held_joints_stay_while_the_soft_robot_looks_around(opened):
+    stage = opened(Exploration(Box(), 3, Explore.dt))
     stage.q = stage.arm.solve(stage.flange(INSIDE), stage.q)
     stage.arm.place(stage.q)
     stage.action = np.zeros(9)
@@ -151,17 +135,19 @@ def test_held_joints_stay_while_the_soft_robot_looks_around() -> None:
     assert np.ptp(joints, axis=0).max() < STILL
     assert np.linalg.norm(np.ptp(tips, axis=0)) > 0.05
     assert stage.seen(0)[0] > 100
-    stage.close()
 
 
-def test_check_fails_where_the_entry_is_blocked() -> None:
-    with pytest.raises(SceneError, match=r"^scene explore: at .* s the soft robot is .* m from a wall"):
-        Explore(box=Box(entry=0.0)).check()
-
-
-def test_check_fails_where_a_corner_has_no_cube() -> None:
-    with pytest.raises(SceneError, match=r"^scene explore: the corner back left top shows in 0 pixels"):
-        Explore(box=Box(marked=(1, 2, 3, 4, 5, 6, 7))).check()
+@pytest.mark.parametrize(
+    ("box", "sentence"),
+    [
+        (Box(entry=0.0), r"^scene explore: at .* s the soft robot is .* m from a wall"),
+        (Box(marked=(1, 2, 3, 4, 5, 6, 7)), r"^scene explore: the corner back left top shows in 0 pixels"),
+    ],
+    ids=["a blocked entry", "a corner without a cube"],
+)
+def test_check_fails(box: Box, sentence: str) -> None:
+    with pytest.raises(SceneError, match=sentence):
+        Explore(box=box).check()
 
 
 def test_actions_mirror_each_other_half_a_period_later() -> None:
@@ -170,8 +156,8 @@ def test_actions_mirror_each_other_half_a_period_later() -> None:
         assert_allclose(second * [1.0, -1.0, 1.0], first, atol=1e-15)
 
 
-def test_ur5_feels_both_soft_robots_wherever_they_are() -> None:
-    stage = DualArmScene(0.005)
+def test_ur5_feels_both_soft_robots_wherever_they_are(opened):
+    stage = opened(DualArmScene(0.005))
     for k in range(60):
         stage.advance(k * stage.dt)
         if k % 20 == 19:
@@ -183,4 +169,3 @@ def test_ur5_feels_both_soft_robots_wherever_they_are() -> None:
             assert np.abs(felt - alone).max() > 0.1 * np.abs(expected).max()
             stage.arm.drive(stage.q)
     assert stage.bases().max() < 1e-6
-    stage.close()

@@ -1,20 +1,18 @@
 """`fastrod view`: ports, hosts and names, right and wrong, without a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
 import urllib.request
 import webbrowser
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import pytest
 
@@ -44,9 +42,7 @@ from fastrod_viewer.worlds import FreeWorld, SceneWorld
         (["prototype", "--host", "192.0.2.1"], "host '192.0.2.1' is not an address of this machine"),
     ],
 )
-def test_what_cannot_be_shown_is_one_sentence(
-    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_shown_is_one_sentence(words, sentence, capsys):
     assert main(["view", "--no-open", *words]) == 2
     said = capsys.readouterr()
     assert sentence in said.err
@@ -100,9 +96,8 @@ def test_a_message_is_sent_although_a_client_began_to_wait_in_that_moment() -> N
 
 
 def test_loopback_is_distinguished() -> None:
-    assert [
-        is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")
-    ] == [True] * 3 + [False] * 3
+    hosts = ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")
+    assert [is_loopback(host) for host in hosts] == [True] * 3 + [False] * 3
 
 
 def test_names_and_files_stand_for_what_they_are(tmp_path: Path) -> None:
@@ -110,7 +105,6 @@ def test_names_and_files_stand_for_what_they_are(tmp_path: Path) -> None:
     assert isinstance(found("wall"), SceneWorld)
     assert isinstance(found(DEMO_LOG), Playback)
     many = found("prototype", n_robots=9)
-    assert isinstance(many, FreeWorld)
     assert len(many.rods[0].state.ok) == 9
     with pytest.raises(UnknownNameError, match="did you mean 'prototype'"):
         found("prototyp")
@@ -126,10 +120,8 @@ def test_what_was_shown_stays_where_another_cannot_be(tmp_path: Path) -> None:
 
 
 def test_a_link_goes_with_its_own_model(tmp_path: Path) -> None:
-    with (
-        App(port=0, folder=tmp_path, say=lambda _: None) as app,
-        pytest.raises(InputError, match="the link's robot 'prototype' has 1 segments"),
-    ):
+    sentence = "the link's robot 'prototype' has 1 segments"
+    with App(port=0, folder=tmp_path, say=lambda _: None) as app, pytest.raises(InputError, match=sentence):
         app.open(FreeWorld(load_robot("tdcr_a")), link=SimulatedRobot(load_robot("prototype")))
 
 
@@ -138,28 +130,14 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    words = [
-        sys.executable,
-        "-m",
-        "fastrod.commands.cli",
-        "view",
-        "prototype",
-        "--no-open",
-        "--port",
-        str(port),
-    ]
+    words = [sys.executable, "-m", "fastrod.commands.cli", "view", "prototype", "--no-open", f"--port={port}"]
 
     def heed() -> None:
         """Background jobs of a shell ignore SIGINT; this one does not."""
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        words, stdout=pipe, stderr=pipe, text=True, env=os.environ, preexec_fn=heed
-    ) as process:
+    with Popen(words, stdout=PIPE, stderr=PIPE, text=True, env=os.environ, preexec_fn=heed) as process:
         try:
-            assert process.stdout is not None
-            assert process.stderr is not None
             printed = rf"prototype: (http://127\.0\.0\.1:{port}/\S+/) \(Ctrl\+C ends it\)\n"
             line = re.fullmatch(printed, process.stdout.readline())
             assert line is not None
@@ -184,13 +162,7 @@ def _address() -> str:
 
 
 @pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
-def test_the_address_is_the_key(
-    host: str,
-    announced: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_address_is_the_key(host, announced, tmp_path, monkeypatch, capsys):
     opened: list[str] = []
 
     def browse(page: str) -> None:

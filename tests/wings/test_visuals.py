@@ -1,10 +1,10 @@
-"""What the bodies of a PyBullet world look like: the triangles stand where PyBullet's own camera sees
-them."""
+"""What a PyBullet world looks like: the triangles stand where PyBullet's own camera sees them."""
 
 import numpy as np
 import pytest
 import trimesh
 from bullets import empty_world
+from numpy.testing import assert_allclose
 
 from fastrod.errors import HostError
 from fastrod.hosts import BulletArm, Visuals
@@ -19,8 +19,11 @@ ROTATION = [0.1, 0.2, -0.3, 0.927361849549570]  # x y z w
 def world():
     made = empty_world()
     yield made
-    if made.isConnected():
-        made.disconnect()
+    made.disconnect()
+
+
+def extent(points):
+    return [points.min(axis=0), points.max(axis=0)]
 
 
 def corners(visuals):
@@ -33,50 +36,41 @@ def corners(visuals):
 
 
 def picture_bounds(world, body, eye=(0.9, -1.1, 1.6), target=(0.1, 0.1, 1.0)):
-    """Least and largest pixel (column, row) that shows the body, and the function that projects points to
-    pixels."""
+    """Least and largest pixel (column, row) that shows the body, and what projects points to pixels."""
     view = np.reshape(world.computeViewMatrix(eye, target, (0, 0, 1)), (4, 4)).T
     projection = np.reshape(world.computeProjectionMatrixFOV(FOV, WIDTH / HEIGHT, 0.05, 10.0), (4, 4)).T
-    _, _, _, _, mask = world.getCameraImage(
-        WIDTH, HEIGHT, view.T.ravel().tolist(), projection.T.ravel().tolist(), renderer=world.ER_TINY_RENDERER
-    )
+    matrices = view.T.ravel().tolist(), projection.T.ravel().tolist()
+    mask = world.getCameraImage(WIDTH, HEIGHT, *matrices, renderer=world.ER_TINY_RENDERER)[4]
     rows, columns = np.nonzero(np.reshape(mask, (HEIGHT, WIDTH)) == body)
 
     def pixels(points):
         clip = np.column_stack([points, np.ones(len(points))]) @ (projection @ view).T
-        ndc = clip[:, :2] / clip[:, 3:]
-        return np.column_stack(
-            [(ndc[:, 0] + 1.0) * WIDTH / 2.0 - 0.5, (1.0 - ndc[:, 1]) * HEIGHT / 2.0 - 0.5]
-        )
+        return ([1.0, 1.0] + [1.0, -1.0] * clip[:, :2] / clip[:, 3:]) * [WIDTH / 2.0, HEIGHT / 2.0] - 0.5
 
     return np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]]), pixels
 
 
-def made(world, kind, tmp_path):
-    if kind == "box":
-        return {"shapeType": world.GEOM_BOX, "halfExtents": [0.05, 0.1, 0.15]}
-    if kind == "sphere":
-        return {"shapeType": world.GEOM_SPHERE, "radius": 0.12}
-    if kind == "cylinder":
-        return {"shapeType": world.GEOM_CYLINDER, "radius": 0.05, "length": 0.4}
-    if kind == "capsule":
-        return {"shapeType": world.GEOM_CAPSULE, "radius": 0.05, "length": 0.3}
-    path = tmp_path / f"wedge.{kind}"
-    wedge = trimesh.Trimesh(
-        [[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
-    )
-    path.write_text(wedge.export(file_type="obj"))
-    return {"shapeType": world.GEOM_MESH, "fileName": str(path), "meshScale": [0.001, 0.002, 0.001]}
+KINDS = {
+    "box": {"halfExtents": [0.05, 0.1, 0.15]},
+    "sphere": {"radius": 0.12},
+    "cylinder": {"radius": 0.05, "length": 0.4},
+    "capsule": {"radius": 0.05, "length": 0.3},
+    "mesh": {"meshScale": [0.001, 0.002, 0.001]},
+}
 
 
-@pytest.mark.parametrize("kind", ["box", "sphere", "cylinder", "capsule", "obj"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("link", [False, True])
 def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
-    seen = world.createVisualShape(
-        **made(world, kind, tmp_path),
-        visualFramePosition=[0.05, -0.03, 0.04],
-        visualFrameOrientation=ROTATION,
+    points, faces = (
+        [[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]],
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
     )
+    wedge = tmp_path / "wedge.obj"
+    wedge.write_text(trimesh.Trimesh(points, faces).export(file_type="obj"))
+    shape = {"fileName": str(wedge)} if kind == "mesh" else {}
+    shape |= {"visualFramePosition": [0.05, -0.03, 0.04], "visualFrameOrientation": ROTATION, **KINDS[kind]}
+    seen = world.createVisualShape(getattr(world, f"GEOM_{kind.upper()}"), **shape)
     links = {
         "linkMasses": [1.0],
         "linkCollisionShapeIndices": [-1],
@@ -106,9 +100,8 @@ def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
     bounds, pixels = picture_bounds(world, body)
     points = pixels(corners(visuals))
     assert np.ptp(bounds, axis=0).min() > 10  # it fills a part of the picture
-    np.testing.assert_allclose(
-        [points.min(axis=0), points.max(axis=0)], bounds, atol=3.5
-    )  # of 60: a pixel, and PyBullet draws round shapes with corners
+    # of 60: a pixel, and PyBullet draws round shapes with corners
+    assert_allclose(extent(points), bounds, atol=3.5)
 
 
 def test_arm_moves_with_its_joints(world):
@@ -118,7 +111,7 @@ def test_arm_moves_with_its_joints(world):
         arm.place(q)
         bounds, pixels = picture_bounds(world, arm.body, eye=(1.5, -1.8, 1.5), target=(0.2, 0.0, 0.8))
         points = pixels(corners(visuals))
-        np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], bounds, atol=2.0)
+        assert_allclose(extent(points), bounds, atol=2.0)
     assert len({shape.name for shape in visuals.shapes}) == len(visuals.shapes)
 
 
@@ -128,25 +121,17 @@ def test_quadruped_encloses_what_touches(world):
     body = world.loadURDF(f"{pybullet_data.getDataPath()}/a1/a1.urdf", [0.3, 0.2, 0.5], [0.0, 0.0, 0.6, 0.8])
     points = corners(Visuals(world))
     boxes = np.array([world.getAABB(body, link) for link in range(-1, world.getNumJoints(body))])
-    center = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
-    np.testing.assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), center, atol=0.05)
-    np.testing.assert_allclose(
-        np.ptp(points, axis=0), boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0), atol=0.1
-    )
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * (low + high), atol=0.05)
+    assert_allclose(np.ptp(points, axis=0), high - low, atol=0.1)
 
 
 def test_colours_and_what_is_left_out(world):
-    red = world.createMultiBody(
-        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[1.0, 0.0, 0.0, 0.5])
-    )
-    blue = world.createMultiBody(
-        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 0.0, 1.0, 1.0])
-    )
-    world.createMultiBody(
-        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 1.0, 0.0, 0.0])
-    )
-    assert [shape.rgba for shape in Visuals(world).shapes] == [(1.0, 0.0, 0.0, 0.5), (0.0, 0.0, 1.0, 1.0)]
-    assert [shape.rgba for shape in Visuals(world, ignore=[red]).shapes] == [(0.0, 0.0, 1.0, 1.0)]
+    colours = [(1.0, 0.0, 0.0, 0.5), (0.0, 0.0, 1.0, 1.0), (0.0, 1.0, 0.0, 0.0)]  # the last is not seen
+    shapes = [world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=colour) for colour in colours]
+    red, blue, _ = (world.createMultiBody(0.0, -1, shape) for shape in shapes)
+    assert [shape.rgba for shape in Visuals(world).shapes] == colours[:2]
+    assert [shape.rgba for shape in Visuals(world, ignore=[red]).shapes] == colours[1:2]
     none = Visuals(world, ignore=[red, blue])
     assert none.shapes == ()
     assert none.poses().shape == (0, 7)
@@ -157,22 +142,20 @@ def test_ground_without_end_is_a_square(world):
 
     world.loadURDF(f"{pybullet_data.getDataPath()}/plane.urdf")
     (shape,) = Visuals(world).shapes
-    np.testing.assert_allclose(np.ptp(shape.vertices, axis=0), [2.0, 2.0, 0.0], atol=1e-3)
+    assert_allclose(np.ptp(shape.vertices, axis=0), [2.0, 2.0, 0.0], atol=1e-3)
     assert shape.vertices[:, 2].max() == 0.0
 
 
 def test_mesh_that_cannot_be_read_is_a_box_around_what_touches(world):
-    vertices, faces = (
-        [[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]],
-        [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2],
-    )
+    vertices = [[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]]
+    faces = [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2]
     seen = world.createVisualShape(world.GEOM_MESH, vertices=vertices, indices=faces)
     touched = world.createCollisionShape(world.GEOM_MESH, vertices=vertices)
     body = world.createMultiBody(
         1.0, touched, seen, [1.0, 2.0, 3.0], ROTATION, baseInertialFramePosition=[0.1, 0.0, 0.0]
     )
     points, box = corners(Visuals(world)), np.array(world.getAABB(body))
-    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], box, atol=1e-6)
+    assert_allclose(extent(points), box, atol=1e-6)
 
 
 def test_body_that_is_gone_is_reported(world):

@@ -1,5 +1,4 @@
-"""The worlds that the viewer shows: they play and obey commands, and a command has the effect that physics
-gives it."""
+"""The worlds that the viewer shows play and obey commands, and a command does what physics says."""
 
 import sys
 from dataclasses import replace
@@ -7,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rods import rod
 
-from fastrod import Robot, Segment, Tendon, load_robot, robot_names, save_robot
+from fastrod import load_robot, robot_names, save_robot
 from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
@@ -27,16 +27,26 @@ def still(world, **options):
 
 def heavy(mode="tendon_length"):
     """A level, heavy robot of one segment."""
-    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
-    segment = Segment(
-        length=0.2,
-        bending_stiffness=(0.01, 0.01),
-        torsional_stiffness=0.008,
-        line_density=0.3,
-        mode=mode,
-        tendons=() if mode == "passive" else tendons,
-    )
-    return Robot(name="heavy", segments=(segment,), base_quaternion=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
+    level = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    material = {"bending_stiffness": (0.01, 0.01), "torsional_stiffness": 0.008, "line_density": 0.3}
+    return replace(rod(mode, length=0.2, **material), name=f"heavy, {mode}", base_quaternion=level)
+
+
+@pytest.fixture
+def shown(opened):
+    """Opens a world by its name."""
+    return lambda name: opened(open_world(name))
+
+
+def action_of(world, *action):
+    """The command with these displacements [m]."""
+    given = world.actions.inputs(action)
+    return ManualCommand(given["tendon_length"], given["extension"])
+
+
+def along(*base):
+    """A displacement of the base."""
+    return np.array([*base, 0.0, 0.0, 0.0])
 
 
 def tip(world):
@@ -50,27 +60,22 @@ def rest(world, command, steps=8):
 
 
 @pytest.mark.parametrize("name", [*robot_names(), *ROD_SCENES, *HOSTED, *MUJOCO_SCENES])
-def test_world_plays_and_obeys(name):
-    world = open_world(name)
-    try:
-        start = world.t
-        for move in (
-            [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.drivable + [world.reset]
-        ):
-            move()
-            poses = world.poses()
-            assert poses.shape == (len(world.bodies), 7)
-            assert np.isfinite(poses).all()
-            for rods in world.rods:
-                assert np.isfinite(rods.state.position).all()
-                assert rods.place.shape == (len(rods.state.ok), 3)
-                assert len(rods.radius) == rods.robots[0].n_segments
-                assert min(rods.radius) > 0.0
-        assert start == world.t == 0.0
-        assert len({body.name for body in world.bodies}) == len(world.bodies)
-        assert all(body.faces.max() < len(body.vertices) for body in world.bodies)
-    finally:
-        world.close()
+def test_world_plays_and_obeys(name, shown):
+    world = shown(name)
+    start, drive = world.t, [lambda: world.drive(still(world))] * world.drivable
+    for move in [world.play] * 5 + drive * 5 + [world.reset]:
+        move()
+        poses = world.poses()
+        assert poses.shape == (len(world.bodies), 7)
+        assert np.isfinite(poses).all()
+        for rods in world.rods:
+            assert np.isfinite(rods.state.position).all()
+            assert rods.place.shape == (len(rods.state.ok), 3)
+            assert len(rods.radius) == rods.robots[0].n_segments
+            assert min(rods.radius) > 0.0
+    assert start == world.t == 0.0
+    assert len({body.name for body in world.bodies}) == len(world.bodies)
+    assert all(body.faces.max() < len(body.vertices) for body in world.bodies)
 
 
 def test_scene_in_mujoco_is_played_and_nobody_drives_it():
@@ -81,11 +86,8 @@ def test_scene_in_mujoco_is_played_and_nobody_drives_it():
         assert_allclose(tip(world), state[1].tip_position[0], atol=1e-12)
     assert not world.drivable
     for refused in (lambda: world.drive(still(world)), world.jacobian):
-        with pytest.raises(
-            InputError,
-            match=r"^scene 'ur5_mujoco' has a script that moves its robots; they "
-            r"cannot be driven by hand\.$",
-        ):
+        sentence = r"^scene 'ur5_mujoco' has a script that moves its robots; they cannot be driven by hand\.$"
+        with pytest.raises(InputError, match=sentence):
             refused()
     world.reset()
     assert world.t == 0.0
@@ -135,17 +137,16 @@ def test_base_moves_the_tip_along(name):
     world = open_world(name)
     before = rest(world, still(world))
     by = np.array([-0.004, 0.002, -0.003])
-    moved = rest(world, still(world, base=np.concatenate([by, np.zeros(3)])))
+    moved = rest(world, still(world, base=along(*by)))
     assert_allclose(moved - before, by, atol=1e-8)
 
 
 def test_base_rotates_about_its_origin():
     world = FreeWorld(load_robot("prototype"))
     before, angle = rest(world, still(world)), np.array([0.3, -0.2, 0.1])
-    rotated = rest(world, still(world, base=np.concatenate([np.zeros(3), angle])))
-    assert_allclose(
-        rotated, matrix_from_quaternion(quaternion_from_vector(angle)[None])[0] @ before, atol=1e-8
-    )
+    rotated = rest(world, still(world, base=np.array([0.0, 0.0, 0.0, *angle])))
+    rotation = matrix_from_quaternion(quaternion_from_vector(angle)[None])[0]
+    assert_allclose(rotated, rotation @ before, atol=1e-8)
 
 
 def test_payload_is_the_force_of_its_weight():
@@ -165,11 +166,8 @@ def test_gravity_off_takes_the_sag_away():
     assert sag[2] < -0.02
     assert_allclose(weightless, [0.2, 0.0, 0.0], atol=1e-8)
     double = FreeWorld(replace(heavy("passive"), gravity=(0.0, 0.0, -2.0 * 9.81)))
-    assert_allclose(
-        rest(world, still(world, gravity=2.0, payload=0.01)),
-        rest(double, still(double, payload=0.01)),
-        atol=1e-7,
-    )
+    twice = rest(world, still(world, gravity=2.0, payload=0.01))
+    assert_allclose(twice, rest(double, still(double, payload=0.01)), atol=1e-7)
 
 
 def test_command_sets_the_tension():
@@ -187,20 +185,12 @@ def test_jacobian_of_a_free_robot(name, n_robots):
     at[-3] = 0.5 * world.robot.segments[-1].extension[1]
 
     def tip_at(action):
-        given = actions.inputs(action)
-        return rest(
-            world,
-            ManualCommand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01])),
-        )
+        return rest(world, replace(action_of(world, *action), tip_force=np.array([0.02, 0.0, 0.01])))
 
-    step, columns = (
-        1e-5,
-        [j for j in range(actions.n_actions) if j % 3 or world.robot.segments[j // 3].extension[1]],
-    )
-    differences = [
-        (tip_at(at + step * e) - tip_at(at - step * e)) / (2.0 * step)
-        for e in np.eye(actions.n_actions)[columns]
-    ]
+    n, extension = actions.n_actions, [segment.extension[1] for segment in world.robot.segments]
+    columns = [j for j in range(n) if j % 3 or extension[j // 3]]
+    steps = 1e-5 * np.eye(n)[columns]
+    differences = [(tip_at(at + e) - tip_at(at - e)) / 2e-5 for e in steps]
     tip_at(at)
     jacobian = world.jacobian()
     assert jacobian.shape == (3, actions.n_actions)
@@ -256,149 +246,104 @@ def test_world_goes_on_after_what_cannot_be_done():
         assert world.t == t
         assert_allclose(tip(world), before)
     jump = world.actions.inputs(np.tile([0.0, 0.01, -0.01], 5))
-    world.drive(
-        replace(still(world, tip_force=np.array([0.3, 0.2, -0.2])), tendon_length=jump["tendon_length"])
-    )
+    force = np.array([0.3, 0.2, -0.2])
+    world.drive(replace(still(world, tip_force=force), tendon_length=jump["tendon_length"]))
     assert np.isfinite(tip(world)).all()
     assert world.t > t
     with pytest.raises(InputError, match="not driven by tendon lengths"):
         FreeWorld(load_robot("ethz_beam")).jacobian()
 
 
-def test_tracking_jacobian_against_the_model():
-    world = open_world("track_circle")
-    try:
-        command = ManualCommand(
-            **{
-                k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k]
-                for k in ("tendon_length", "extension")
-            }
-        )
-        rest(world, command, 40)
-        jacobian = world.jacobian()
-        assert jacobian.shape == (3, 6 + 6)
-        arm, kinematics = world._stage.arm, world._stage.robot.kinematics
-        q = np.concatenate([arm.position(), [0.015, 0.004, 0.002, 0.015, -0.003, 0.003]])
-        assert_allclose(jacobian, kinematics.finite_differences(q, 1e-5), atol=2e-3 * np.abs(jacobian).max())
-        world.drive(replace(command, freeze=True))
-        held = arm.position()
-        rest(world, replace(command, freeze=True, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), 10)
-        assert_allclose(arm.position(), held, atol=1e-4)
-        assert not world.jacobian()[:, :6].any()
-        assert_allclose(world.jacobian()[:, 6:], jacobian[:, 6:], atol=1e-2 * np.abs(jacobian).max())
-    finally:
-        world.close()
+def test_tracking_jacobian_against_the_model(shown):
+    world = shown("track_circle")
+    action = [0.015, 0.004, 0.002, 0.015, -0.003, 0.003]
+    command = action_of(world, *action)
+    rest(world, command, 40)
+    jacobian = world.jacobian()
+    assert jacobian.shape == (3, 6 + 6)
+    arm, kinematics = world._stage.arm, world._stage.robot.kinematics
+    q = np.concatenate([arm.position(), action])
+    assert_allclose(jacobian, kinematics.finite_differences(q, 1e-5), atol=2e-3 * np.abs(jacobian).max())
+    world.drive(replace(command, freeze=True))
+    held = arm.position()
+    rest(world, replace(command, freeze=True, base=along(0.1, 0.0, 0.0)), 10)
+    assert_allclose(arm.position(), held, atol=1e-4)
+    assert not world.jacobian()[:, :6].any()
+    assert_allclose(world.jacobian()[:, 6:], jacobian[:, 6:], atol=1e-2 * np.abs(jacobian).max())
 
 
-@pytest.mark.parametrize(
-    ("name", "bracket"),
-    [
-        ("track_circle", lambda s: s.robot.bracket),
-        ("explore", lambda s: s.bracket),
-        ("dual_arm", lambda s: s.bracket),
-    ],
-)
-def test_command_moves_the_flange(name, bracket):
-    world = open_world(name)
-    try:
-        stage = world._stage
-        command = still(world)
-        before = rest(world, command, 60)
-        flange = stage.arm.frame(stage.arm.position())
-        by = np.array([0.01, -0.02, 0.015])
-        rest(world, replace(command, base=np.concatenate([by, np.zeros(3)])), 60)
-        assert_allclose(stage.arm.frame(stage.arm.position())[:3] - flange[:3], by, atol=2e-4)
-        assert_allclose(tip(world) - before, by, atol=5e-4)
-        place = [
-            w
-            for w, body in zip(world.poses(), world.bodies, strict=True)
-            if body.name == f"body {bracket(stage).body}"
-        ]
-        # the bracket has come along
-        assert_allclose(place[0][:3], stage.arm.frame(stage.arm.position())[:3], atol=1e-4)
-    finally:
-        world.close()
+@pytest.mark.parametrize("name", ["track_circle", "explore", "dual_arm"])
+def test_command_moves_the_flange(name, shown):
+    world = shown(name)
+    stage = world._stage
+    command = still(world)
+    before = rest(world, command, 60)
+    flange = stage.arm.frame(stage.arm.position())
+    by = np.array([0.01, -0.02, 0.015])
+    rest(world, replace(command, base=along(*by)), 60)
+    assert_allclose(stage.arm.frame(stage.arm.position())[:3] - flange[:3], by, atol=2e-4)
+    assert_allclose(tip(world) - before, by, atol=5e-4)
+    bracket = (stage.robot if name == "track_circle" else stage).bracket
+    place = world.poses()[[body.name for body in world.bodies].index(f"body {bracket.body}")]
+    # it has come along
+    assert_allclose(place[:3], stage.arm.frame(stage.arm.position())[:3], atol=1e-4)
 
 
-def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
-    world = open_world("track_circle")
-    try:
-        command = still(world)
-        rest(world, command, 30)
-        before = world._stage.arm.position()
-        far = replace(
-            command, base=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), extension=np.array([0.01, 0.01])
-        )
-        far = replace(
-            far, tendon_length=world.actions.inputs([0.01, 0.0, 0.0, 0.01, 0.0, 0.0])["tendon_length"]
-        )
-        t = world.t
-        with pytest.raises(HostError, match=r"flange|no joint positions"):
-            world.drive(far)
-        assert world.t == pytest.approx(t + world.dt)
-        assert world.rods[0].state.arclength[0, -1] == pytest.approx(0.22)
-        assert_allclose(world._stage.arm.position(), before, atol=1e-4)
-        rate = np.array([0.3, 0.0, 0.0, 0.0, 0.0, -0.5])
-        rest(world, replace(command, base_rate=rate), 50)
-        assert_allclose(world._stage.arm.position() - before, 50 * world.dt * rate, atol=2e-3)
-        after = world._stage.arm.position()
-        # from where a drag has brought the arm, the commanded base continues
-        rest(world, replace(command, base=far.base), 5)
-        assert_allclose(world._stage.arm.position(), after, atol=2e-3)
-        with pytest.raises(InputError, match="extension"):
-            world.drive(replace(command, extension=np.array([0.5, 0.0])))
-        world.play()
-        assert world.t == 0.0  # the script begins anew
-    finally:
-        world.close()
+def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on(shown):
+    world = shown("track_circle")
+    command = still(world)
+    rest(world, command, 30)
+    before = world._stage.arm.position()
+    far = replace(action_of(world, 0.01, 0.0, 0.0, 0.01, 0.0, 0.0), base=along(3.0, 0.0, 0.0))
+    t = world.t
+    with pytest.raises(HostError, match=r"flange|no joint positions"):
+        world.drive(far)
+    assert world.t == pytest.approx(t + world.dt)
+    assert world.rods[0].state.arclength[0, -1] == pytest.approx(0.22)
+    assert_allclose(world._stage.arm.position(), before, atol=1e-4)
+    rate = np.array([0.3, 0.0, 0.0, 0.0, 0.0, -0.5])
+    rest(world, replace(command, base_rate=rate), 50)
+    assert_allclose(world._stage.arm.position() - before, 50 * world.dt * rate, atol=2e-3)
+    after = world._stage.arm.position()
+    # from where a drag has brought the arm, the commanded base continues
+    rest(world, replace(command, base=far.base), 5)
+    assert_allclose(world._stage.arm.position(), after, atol=2e-3)
+    with pytest.raises(InputError, match="extension"):
+        world.drive(replace(command, extension=np.array([0.5, 0.0])))
+    world.play()
+    assert world.t == 0.0  # the script begins anew
 
 
-def test_other_rods_keep_their_inputs():
-    world = open_world("dual_arm")
-    try:
-        second = world.rods[1].state.path_length.copy()
-        rest(
-            world,
-            ManualCommand(
-                world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)
-            ),
-            30,
-        )
-        assert_allclose(world.rods[1].state.path_length, second, atol=1e-4)
-        assert np.abs(world.rods[0].state.path_length - second).max() > 1e-3
-    finally:
-        world.close()
+def test_other_rods_keep_their_inputs(shown):
+    world = shown("dual_arm")
+    second = world.rods[1].state.path_length.copy()
+    rest(world, action_of(world, 0.0, 0.004, 0.0, 0.0, 0.0, 0.004), 30)
+    assert_allclose(world.rods[1].state.path_length, second, atol=1e-4)
+    assert np.abs(world.rods[0].state.path_length - second).max() > 1e-3
 
 
-def test_pictures_and_scripts_without_a_command():
-    explore, pick = open_world("explore"), open_world("pick_suction")
-    try:
-        picture = explore.picture()
-        assert picture.shape == (120, 160, 3)
-        assert picture.dtype == np.uint8
-        assert np.ptp(picture) > 0
-        assert pick.picture() is None
-        assert (pick.drivable, pick.host, pick.base_moves, pick.loads) == (False,) * 4
-        assert not any("Capsule" in body.name for body in pick.bodies)
-        with pytest.raises(InputError, match="cannot be driven by hand"):
-            pick.drive(still(pick))
-        with pytest.raises(InputError, match="no Jacobian"):
-            pick.jacobian()
-    finally:
-        explore.close()
-        pick.close()
+def test_pictures_and_scripts_without_a_command(shown):
+    explore, pick = shown("explore"), shown("pick_suction")
+    picture = explore.picture()
+    assert picture.shape == (120, 160, 3)
+    assert picture.dtype == np.uint8
+    assert np.ptp(picture) > 0
+    assert pick.picture() is None
+    assert (pick.drivable, pick.host, pick.base_moves, pick.loads) == (False,) * 4
+    assert not any("Capsule" in body.name for body in pick.bodies)
+    with pytest.raises(InputError, match="cannot be driven by hand"):
+        pick.drive(still(pick))
+    with pytest.raises(InputError, match="no Jacobian"):
+        pick.jacobian()
 
 
-def test_rods_capsules_are_no_bodies():
-    world = open_world("neck_push")
-    try:
-        numbers = {int(body.name.split()[1]) for body in world.bodies}
-        assert not numbers & set(world._stage.rod.bodies.ids)
-        assert world._stage.cube in numbers
-        assert not world.host
-        assert world.drivable
-    finally:
-        world.close()
+def test_rods_capsules_are_no_bodies(shown):
+    world = shown("neck_push")
+    numbers = {int(body.name.split()[1]) for body in world.bodies}
+    assert not numbers & set(world._stage.rod.bodies.ids)
+    assert world._stage.cube in numbers
+    assert not world.host
+    assert world.drivable
 
 
 def test_close_disconnects():
@@ -431,10 +376,12 @@ def test_world_of_a_robot_a_path_and_a_wrong_name(tmp_path):
     assert open_world(str(tmp_path / "mine.toml")).robot == robot
     assert open_world(robot).name == "mine"
     assert about(robot) == "One segment, 0.07 m, driven by the lengths of its tendons."
-    with pytest.raises(UnknownNameError, match="no scene and no robot 'explor'; did you mean 'explore'"):
-        open_world("explor")
-    with pytest.raises(UnknownNameError, match="did you mean 'tdcr_a'"):
-        open_world("tdrc_a")
+    for name, nearest in (
+        ("explor", "no scene and no robot 'explor'; did you mean 'explore'"),
+        ("tdrc_a", "did you mean 'tdcr_a'"),
+    ):
+        with pytest.raises(UnknownNameError, match=nearest):
+            open_world(name)
     with pytest.raises(RobotError, match="cannot be read"):
         open_world(tmp_path / "none.toml")
 
@@ -458,19 +405,16 @@ def test_grid_of_robots_is_drawn_where_it_stands():
     bases = world.rods[0].state.position[:, 0]
     assert len(np.unique(bases.round(6), axis=0)) == 64
     assert not world.rods[0].place.any()
-    world.drive(still(world, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    world.drive(still(world, base=along(0.1, 0.0, 0.0)))
     assert_allclose(world.rods[0].state.position[:, 0] - bases, np.tile([0.1, 0.0, 0.0], (64, 1)), atol=1e-12)
     assert world.jacobian().shape == (3, 15)
 
 
-def test_hosted_view_resets_where_its_script_ends():
-    world = open_world("neck_push")
+def test_hosted_view_resets_where_its_script_ends(shown):
+    world = shown("neck_push")
     assert isinstance(world, HostedView)
-    try:
-        first = tip(world)
-        world._steps = round(world.duration / world.dt)
-        world.play()
-        assert world.t == 0.0
-        assert_allclose(tip(world), first, atol=1e-6)
-    finally:
-        world.close()
+    first = tip(world)
+    world._steps = round(world.duration / world.dt)
+    world.play()
+    assert world.t == 0.0
+    assert_allclose(tip(world), first, atol=1e-6)

@@ -28,7 +28,7 @@ def separating_run(one: str, other: str) -> str:
 
 def look_at(pattern: str) -> str:
     """What to do about a pattern that no effect of the library makes."""
-    return f"look at the robot: {pattern}; mend it, or register an effect of your own for it, and run again"
+    return f"look at the robot: {pattern}; fix it, or register an effect of your own for it, and run again"
 
 
 def loaded(samples: LogSamples, robot: Robot) -> bool:
@@ -63,12 +63,12 @@ def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
     lacks = []
     if not _base_rotates(log.base_quaternion):
         lacks.append(
-            "one base orientation only: gravity and payload cannot be told from zeros, "
+            "one base orientation only: gravity and payload cannot be distinguished from zeros, "
             "registration or precurvature"
         )
     if log.payload is None and log.tip_force is None:
         lacks.append(
-            "no known load: stretch of the wires cannot be told from the gain of the drives, "
+            "no known load: stretch of the tendons cannot be distinguished from the gain of the drives, "
             "stiffness is not seen"
         )
     size = np.linalg.norm(bend, axis=-1)
@@ -83,7 +83,9 @@ def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
         if samples.time[samples.rows[rows[-1]]] - samples.time[samples.rows[rows[0]]] >= 2.0
     ]
     if not holds:
-        lacks.append("no holds: creep cannot be told from friction, and the noise is not known from rest")
+        lacks.append(
+            "no holds: creep cannot be distinguished from friction, and the noise is not known from rest"
+        )
     if bend.shape[1] > 1:
         moved = size > 0.1
         if not any(

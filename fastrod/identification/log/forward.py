@@ -1,17 +1,19 @@
 """A log through the model: commands, effects, rod, camera; for any vector of unknowns.
 
-The operators on the wires run causally over every sample of every run. The rod is static, so each sample is
+The operators on the tendons run causally over every sample of every run. The rod is static, so each sample is
 one robot of a batch, and only those samples are solved that the loss looks at.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.effects.base import Effect, Seam, get_effect, has_memory
+from fastrod.effects.base import Seam, has_memory
+from fastrod.effects.executor import Link, SensedPoses, act, from_base, link, sense, sweep
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
@@ -116,21 +118,16 @@ class PredictedRod:
             ports, params, self._tolerance, None if rows is None or rows.all() else np.flatnonzero(rows)
         )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
-        rotation = matrix_from_quaternion(np.broadcast_to(ports.base_pose, (len(state.ok), 7))[:, 3:])
-        origin = ports.base_pose[:, :3]
         points = np.zeros((len(state.ok), 0, 3))
         if self.points:
             points = (
                 self._sim.shape(
                     np.minimum(np.array(robot.log_points), np.nanmin(state.arclength[:, -1]))
                 ).position
-                - origin[:, None]
+                - ports.base_pose[:, None, :3]
             )
         return PredictedPose(
-            np.einsum("nji,nj->ni", rotation, state.tip_position - origin),
-            np.swapaxes(rotation, 1, 2) @ state.tip_rotation,
-            np.einsum("nji,nkj->nki", rotation, points),
-            state.ok,
+            *from_base(ports.base_pose, state.tip_position, state.tip_rotation, points), state.ok
         )
 
     def keep(self) -> object:
@@ -152,6 +149,7 @@ class PreparedLog:
     ports: Ports
     """Of the rows."""
     params: Params
+    reader: Reader
     dl: Floats
     """(n, n_tendons) commanded, of every sample [m]."""
     base_rotation: Floats
@@ -174,155 +172,77 @@ class PreparedLog:
             base_rotation=base_rotation,
             time=time,
             n_steps=N_STEPS,
+            stateless=True,
         )
 
-    def tendon_changes(self, effects: list[tuple[Effect, Floats]]) -> Floats | None:
-        """(n_rows, n_tendons) change of wire length [m] after the effects of `effects` up to the last one
-        with a memory, over every sample; None where none has a memory."""
-        last = max((i for i, (what, _) in enumerate(effects) if has_memory(what)), default=-1)
-        if last < 0:
-            return None
-        samples, n = self.samples, len(self.dl)
-        opened = self._open(
-            self._alone(self.dl + self.robot.rest_tendon_length), n, samples.time, self.base_rotation[:1]
-        )
-        for what, values in effects[: last + 1]:
-            if not has_memory(what):
-                what.apply(np.broadcast_to(values, (n, len(values))), np.empty((n, 0)), opened, None, 0.0)
-                continue
-            dl = opened.dl
-            out = np.empty_like(dl)
-            for span in samples.runs:
-                if hasattr(what, "sweep"):
-                    memory = what.memory(1, self.wiring.n_tendons)
-                    out[span] = what.sweep(
-                        values[None], memory, dl[None, span], samples.dt[span], self.wiring
-                    )[0]
+    def drive(self, links: Sequence[Link]) -> EffectPorts:
+        """Ports of the rows after the effects of `links`, but for sensing. Up to the last one with a memory
+        they run over every sample, for the tendons' lengths."""
+        opened, rest = self.open(), self.robot.rest_tendon_length
+        swept = 1 + max((i for i, each in enumerate(links) if has_memory(each.effect)), default=-1)
+        if swept:
+            alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
+            every = self._open(alone, len(self.dl), self.samples.time, self.base_rotation[:1])
+            for each in links[:swept]:
+                if has_memory(each.effect):
+                    sweep(each, every, self.samples.runs, self.samples.dt)
                 else:
-                    out[span] = self._step_by_step(what, values, dl[span], span)
-            opened.shift_tendons(out - dl)
-        return opened.dl[samples.rows]
-
-    def _alone(self, length: Floats) -> Ports:
-        """Ports with these wire lengths and nothing else."""
-        bare = {
-            name: getattr(self.ports, name)[:1]
-            for name in ("tension", "base_pose", "extension", "tip_force", "tip_moment", "line_force")
-        }
-        return self.ports._replace(tendon_length=length, **bare)
-
-    def _step_by_step(self, what: Effect, values: Floats, dl: Floats, span: slice) -> Floats:
-        """An effect with a memory that has no `sweep`, over one run: one sample after the other, slowly."""
-        memory = what.memory(1, self.wiring.n_tendons)
-        out = np.empty_like(dl)
-        for i in range(len(dl)):
-            at = span.start + i
-            one = self._open(
-                self._alone(dl[i : i + 1] + self.robot.rest_tendon_length),
-                1,
-                self.samples.time[at : at + 1],
-                self.base_rotation[:1],
-            )
-            what.apply(values[None], memory, one, None, float(self.samples.dt[at]))
-            out[i] = one.dl[0]
-        return out
-
-    def drive(self, effects: list[tuple[Effect, Floats]]) -> EffectPorts:
-        """Ports of the rows after the effects of `effects`, but for sensing."""
-        before = [each for each in effects if each[0].seam is Seam.ACTUATION]
-        last = max((i for i, (what, _) in enumerate(before) if has_memory(what)), default=-1)
-        opened = self.open()
-        for what, values in before[: last + 1]:  # for what they change beside the wires' lengths
-            if not has_memory(what):
-                what.apply(
-                    np.broadcast_to(values, (len(opened), len(values))),
-                    np.empty((len(opened), 0)),
-                    opened,
-                    None,
-                    0.0,
-                )
-        tendon_changes = self.tendon_changes(before)
-        if tendon_changes is not None:
-            opened.tendon_length = tendon_changes + self.robot.rest_tendon_length
-        rest = before[last + 1 :] + [each for each in effects if each[0].seam in (Seam.MATERIAL, Seam.LOAD)]
-        for what, values in rest:
-            what.apply(
-                np.broadcast_to(values, (len(opened), len(values))),
-                np.empty((len(opened), 0)),
-                opened,
-                None,
-                0.0,
-            )
+                    act([each.on(len(every))], every)
+                    act([each.on(len(opened))], opened)  # for what it changes beside the tendons' lengths
+            opened.tendon_length = every.dl[self.samples.rows] + rest
+        act([each.on(len(opened)) for each in links[swept:]], opened)
         return opened
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
-        return close_ports(opened, self.ports, self.params)
+        ports, params, points = close_ports(opened, self.ports, self.params)
+        return self.reader.with_point_forces(ports, Inputs(), points)[0] if points else ports, params
 
-    def see(
-        self, pose: PredictedPose, effects: list[tuple[Effect, Floats]], opened: EffectPorts | None = None
-    ) -> PredictedPose:
-        """The pose as the camera sees it, by the effects of sensing in `effects`; `opened`: ports that the
-        others have changed."""
-        sensing = [each for each in effects if each[0].seam is Seam.SENSING]
+    def see(self, pose: PredictedPose, links: Sequence[Link]) -> PredictedPose:
+        """The pose as the camera sees it, by the effects of sensing in `links`."""
+        sensing = [each.on(len(pose.ok)) for each in links if each.effect.seam is Seam.SENSING]
         if not sensing:
             return pose
-        ports = self.open() if opened is None else opened
-        ports.tip_position, ports.tip_rotation, ports.points = (
-            pose.position.copy(),
-            pose.rotation.copy(),
-            pose.points.copy(),
-        )
-        for what, values in sensing:
-            what.apply(
-                np.broadcast_to(values, (len(ports), len(values))),
-                np.empty((len(ports), 0)),
-                ports,
-                None,
-                0.0,
-            )
-        return PredictedPose(ports.tip_position, ports.tip_rotation, ports.points, pose.ok)
+        return PredictedPose(*sense(sensing, self.open(), SensedPoses(*pose[:3])), pose.ok)
 
 
 def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
     """The inputs of the rows of `samples` for `robot`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
-    ports = Reader(layout, params, rest, len(log)).ports(_given(inputs(log, robot)))
+    reader = Reader(layout, params, rest, len(log))
+    ports = reader.ports(Inputs(**dict[str, Any](inputs(log, robot))))
     return PreparedLog(
         robot,
         wiring,
         samples,
         ports,
         params,
+        reader,
         np.asarray(samples.log.dl),
         matrix_from_quaternion(ports.base_pose[:, 3:]),
     )
 
 
-def _given(keywords: dict[str, Floats]) -> Inputs:
-    return Inputs(**dict[str, Any](keywords))
+def effects_at(model: Model, theta: Floats) -> list[Link]:
+    """The effects of a model at `theta`, one row of values each, in the order in which they act.
 
-
-def effects_at(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
-    """The effects of a model at `theta` with their values, in the order in which they act.
-
-    Raises `InputError` for a memory beyond the wires: only those are carried over a log.
+    Raises `InputError` for a memory beyond the tendons: only those are carried over a log.
     """
-    for name in model.effects:
-        what = get_effect(name)
-        if what.seam is not Seam.ACTUATION and has_memory(what):
+    n_tendons = model.wiring.n_tendons
+    links = [link(name, values[None], n_tendons) for name, values in model.values(theta).items()]
+    for each in links:
+        if each.effect.seam is not Seam.ACTUATION and has_memory(each.effect):
             raise InputError(
-                f"effect {name!r} has a memory at the seam {what.seam.name}; over a log only "
+                f"effect {each.name!r} has a memory at the seam {each.effect.seam.name}; over a log only "
                 "those of ACTUATION are carried."
             )
-    return [(get_effect(name), values) for name, values in model.values(theta).items()]
+    return links
 
 
 def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod) -> PredictedPose:
     """What the camera sees at the rows of `samples`, solved exactly."""
     robot = model.robot_at(theta)
     place = prepare_log(samples, robot, model.wiring)
-    effects = effects_at(model, theta)
-    pose = rod.solve(*place.kernel(place.drive(effects)), robot)
-    return place.see(pose, effects)
+    links = effects_at(model, theta)
+    return place.see(rod.solve(*place.kernel(place.drive(links)), robot), links)

@@ -18,7 +18,7 @@ from fastrod.errors import InputError, LogError
 from fastrod.identification.log.inputs import base_of, inputs
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod.types import Floats
+from fastrod.types import Floats, Ints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,25 +138,25 @@ def replay(
             "nothing to compare."
         )
     open_questions: tuple[str, ...] = ()
+    rows, n_points = np.flatnonzero(log.driven), 0 if log.points is None else len(robot.log_points)
+    tip, points = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan)
+    converged = np.zeros(len(log), dtype=np.bool_)
+    solved: Callable[[Ints], tuple[Floats, Floats, Mask]] | None = None
     if simulator is None:
         # these load numba, which no other command line word needs
         from fastrod.identification.log.questions import questions
         from fastrod.simulator import Simulator
 
-        open_questions = questions(log, robot)
+        open_questions, simulator = questions(log, robot), Simulator
         if robot.effects:
-            return _with_effects(log, robot, progress, open_questions)
-        simulator = Simulator
-    n_points = 0 if log.points is None else len(robot.log_points)
-    tip, points, converged = (
-        np.full((len(log), 3), np.nan),
-        np.full((len(log), n_points, 3), np.nan),
-        np.zeros(len(log), dtype=np.bool_),
-    )
-    rows = np.flatnonzero(log.driven)
+            rows, solved = _with_effects(log, robot, n_points > 0)
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
-        tip[chunk], points[chunk], converged[chunk] = _solve(log.rows(chunk), robot, simulator)
+        tip[chunk], points[chunk], converged[chunk] = (
+            solved(np.arange(start, start + len(chunk)))
+            if solved
+            else _solve(log.rows(chunk), robot, simulator)
+        )
         if progress is not None:
             progress(start + len(chunk), len(rows))
     tip[~converged], points[~converged] = np.nan, np.nan
@@ -170,32 +170,21 @@ def replay(
     )
 
 
-def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, questions: tuple[str, ...]) -> Replay:
+def _with_effects(
+    log: RunLog, robot: Robot, with_points: bool
+) -> tuple[Ints, Callable[[Ints], tuple[Floats, Floats, Mask]]]:
+    """Rows of the log in the order of its runs, and what solves some of these."""
     from fastrod.identification.log.forward import PredictedRod, predict, sample  # they load numba
     from fastrod.identification.log.unknowns import known_model
 
     samples, model = sample(log), known_model(robot)
-    n_points = 0 if log.points is None else len(robot.log_points)
-    tip, points, converged = (
-        np.full((len(log), 3), np.nan),
-        np.full((len(log), n_points, 3), np.nan),
-        np.zeros(len(log), dtype=np.bool_),
-    )
-    for start in range(0, len(samples.log), CHUNK):
-        piece = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
-        pose = predict(model, np.zeros(0), piece, PredictedRod(piece, robot, points=n_points > 0))
-        rows = samples.origin[piece.rows[pose.ok]]
-        tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
-        if progress is not None:
-            progress(piece.rows[-1] + 1, len(samples.log))
-    return Replay(
-        log=log,
-        robot=robot,
-        tip_position=tip,
-        converged=converged,
-        points=points if n_points else None,
-        questions=questions,
-    )
+
+    def solved(which: Ints) -> tuple[Floats, Floats, Mask]:
+        piece = samples.on(which)
+        pose = predict(model, np.zeros(0), piece, PredictedRod(piece, robot, points=with_points))
+        return pose.position, pose.points, pose.ok
+
+    return samples.origin, solved
 
 
 def make_folder(path: str | Path) -> Path:

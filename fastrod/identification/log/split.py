@@ -1,19 +1,62 @@
-"""Which samples no fit sees."""
+"""Logs of one robot as one, and which of its samples a fit may see."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fastrod.errors import LogError, UnknownNameError, nearest
-from fastrod.identification.log.forward import LogSamples
+from fastrod.errors import InputError, LogError, UnknownNameError, nearest
+from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.logs.runlog import RunLog
-from fastrod.types import Flags
+from fastrod.model.robot import Robot
+from fastrod.types import Flags, Ints
 
+_LEAST_ROWS = 40
 _STRETCHES = 20  # of each run, of which every fourth is held out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SplitLog:
+    """The samples of a log, those for fits and those for tests."""
+
+    samples: LogSamples
+    """Compared at every measured row."""
+    rows: Ints
+    """Samples that may be fitted."""
+    tested: Flags
+    """(n,) samples that no fit sees."""
+    labels: Sequence[str]
+    """What these are, in words."""
+
+
+def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> SplitLog:
+    """The samples of `logs` of `robot`; `held_out` as for `held_out_rows`. Raises `LogError` where they
+    cannot tell anything, `InputError` for a robot that is driven by tensions."""
+    log = merged(logs)
+    if not log.driven.any():
+        raise LogError(
+            f"log {log.name!r} has no row in which every input is there; there is nothing to "
+            "drive the model with."
+        )
+    samples = sample(log)
+    check_log(samples, robot)
+    tested, labels = held_out_rows(samples, held_out)
+    rows = samples.rows[~tested[samples.rows]]
+    if len(rows) < _LEAST_ROWS:
+        raise LogError(
+            f"log {log.name!r} leaves {len(rows)} rows to fit once {', '.join(labels)} are held "
+            f"out; it needs {_LEAST_ROWS}."
+        )
+    return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels)
+
+
+def thinned(rows: Ints, most: int) -> Ints:
+    """At most so many of the rows, evenly."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).round().astype(int)]
 
 
 def merged(logs: Sequence[RunLog]) -> RunLog:
@@ -27,7 +70,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     if len(set(names)) < len(names):
         raise LogError(
             f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that "
-            "their runs can be told apart."
+            "their runs can be distinguished."
         )
     if len({log.dl.shape[1] for log in logs}) > 1:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
@@ -112,3 +155,41 @@ def held_out_rows(samples: LogSamples, held_out: Sequence[str]) -> tuple[Flags, 
     if mask[samples.rows].all():
         raise LogError(f"everything in log {log.name!r} is held out; leave something to fit.")
     return mask, list(map(str, held_out))
+
+
+def check_log(samples: LogSamples, robot: Robot) -> None:
+    """A log that cannot tell anything is refused in a sentence."""
+    log = samples.log
+    measured = int(log.measured.sum())
+    if measured == 0:
+        raise LogError(
+            f"log {log.name!r} has no row in which every input and the tip are there; there is "
+            "nothing to explain."
+        )
+    if measured < _LEAST_ROWS:
+        raise LogError(
+            f"log {log.name!r} has {measured} measured rows; identification needs {_LEAST_ROWS} "
+            "at least, better two thousand."
+        )
+    inputs = [
+        log.dl,
+        *(
+            a.reshape(len(log), -1)
+            for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
+            if a is not None
+        ),
+    ]
+    moves = np.concatenate([np.ptp(a, axis=0) for a in inputs]) if inputs else np.zeros(0)
+    if not (moves > 1e-9).any():
+        raise LogError(
+            f"in log {log.name!r} no input ever changes; nothing can be learnt from it. fastrod "
+            "excite writes a run that does."
+        )
+    if float(np.ptp(np.asarray(log.tip_position)[log.measured], axis=0).max()) < 1e-7 * robot.length:
+        raise LogError(f"in log {log.name!r} the measured tip never moves; is the camera's column filled?")
+    for mode, number in ((s.mode, k) for k, s in enumerate(robot.segments, 1)):
+        if mode == "tendon_tension":
+            raise InputError(
+                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a "
+                "run log gives tendon lengths."
+            )

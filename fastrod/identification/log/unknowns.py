@@ -308,8 +308,7 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
 def _drive_unknowns(
     wiring: Routing, kind: str, which: list[int], sd: float, shared: bool, target: str
 ) -> list[Unknown]:
-    """Gains and zeros of wires are those of their drives: antagonists of one drive cannot be told apart by a
-    bend."""
+    """Gains and zeros of tendons are those of their drives: no bend tells antagonists of one drive apart."""
     name = "drum_gain" if kind == "gain" else "encoder_offset"
     unit = _TENDON[kind]
     drives = list(dict.fromkeys(int(wiring.drive[t]) for t in which))

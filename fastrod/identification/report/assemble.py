@@ -3,26 +3,26 @@ verdict."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
-from fastrod.identification.log.limits import limits
+from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.noise import keep
-from fastrod.identification.log.unknowns import Model
+from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
-from fastrod.identification.report.verdict import choose_verdict
-from fastrod.identification.search.base import SEEN, BaseFit, rms
+from fastrod.identification.report.verdict import VerdictGrounds, choose_verdict
+from fastrod.identification.search.base import SEEN, BaseFit, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
-from fastrod.identification.search.residual_test import residual_structure
-from fastrod.identification.search.search import Search
-from fastrod.identification.search.solve import Estimate, covariance
+from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.search import Search, SearchOutcome
+from fastrod.identification.search.solve import Estimate, covariance, rms
 from fastrod.model.robot import Robot
-from fastrod.types import Flags, Floats, Ints
+from fastrod.types import Flags, Floats
 
 ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
@@ -30,146 +30,162 @@ _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 # of the error above the noise: where so much is left, shear and inertia are worth a sentence
 _SAY_LIMITS = 0.05
+_SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
+_WORTH_SAYING = 0.03
+_SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
-def assemble(
-    *,
-    samples: LogSamples,
-    rows: Ints,
-    tested: Flags,
-    labels: Sequence[str],
-    base: BaseFit,
-    search: Search,
-    start: ModelState,
-    last: ModelState,
-    last_sigma: Floats,
-    state: ModelState,
-    found: list[str],
-    steps: list[SearchStep],
-    fixed: dict[str, Estimate],
-    threads: int | None,
-) -> Result:
-    """The result of a search: `start` without effects, `state` with those `found`, `last` with foils too.
-    What was found is fitted again to the training `rows`, of which the search saw a part."""
-    robot = base.robot
-    inspected = residual_structure(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
-    squares = {"base": _square(start, base.weights[0]), "library": _square(state, base.target.sigma)}
-    squares["after"] = min(squares["library"], _square(last, last_sigma))
-    order = np.argsort([-_own(state, name) for name in found]) if len(found) > 1 else range(len(found))
-    found = [found[int(i)] for i in order]
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What was found, on every sample: fitted again to all training rows, of which the search saw a part."""
+
+    search: Search
+    start: ModelState
+    """Without effects."""
+    state: ModelState
+    """With those that were found."""
+    names: tuple[str, ...]
+    """Of these, what moves the prediction most first."""
+    outlier: Flags
+    used: Flags
+    test: Flags
+    """(n,) each."""
+    before: Floats
+    after: Floats
+    """(n, 3) predicted tip [m], both."""
+    train_error: Error
+    test_error: Error
+
+
+def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
+    """The base model and what was found beside it, predicted on every sample of a log."""
+    samples, rows = log.samples, thinned(log.rows, ALL_AT_ONCE)
+    search, state, names = outcome.search, outcome.state, outcome.names
+    start = outcome.start
+    if len(names) > 1:
+        names = tuple(names[i] for i in np.argsort([-_own(state, name) for name in names]))
     if len(rows) > len(search.samples.rows):
-        whole = base.on(samples.on(rows), start)
-        search = Search(whole.samples, whole.rod, whole.target, whole.block, search.excluded)
-        state = _nearer(state, search.again(state), samples, rows, robot, threads)
+        piece = samples.on(rows)
+        search = search_on(piece, base, search.target.sigma)
+        state = _nearer(state, search.again(state), piece, base)
         # with its own weights: what the base model does not explain must not push its parameters
-        rough = base.on(samples.on(rows), start)
-        rough.weigh(base.weights[0])
-        again = Search(rough.samples, rough.rod, rough.target, rough.block, search.excluded).again(start)
-        start = _nearer(start, again, samples, rows, robot, threads)
-    outlier = np.zeros(len(samples.log), bool)
-    before = _everywhere(start.model, start.theta, samples, robot, threads)
-    after = _everywhere(state.model, state.theta, samples, robot, threads) if found else before
-    measured = samples.log.measured
+        again = search_on(piece, base, base.search.target.sigma).again(start)
+        start = _nearer(start, again, piece, base)
+    before = _everywhere(start, samples, base)
+    after = _everywhere(state, samples, base) if names else before
+    measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
     residual = np.asarray(samples.log.tip_position) - before
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
     outlier[seen] = ~keep(samples.on(seen), residual[seen], base.noise)
-    used = measured & ~tested & ~outlier
-    test = measured & tested & ~outlier
-    train_error = _error(samples, before, after, used)
-    test_error = _error(samples, before, after, test)
-    path = _path(start, state, found, samples, robot, used, test, search, threads)
-    grounds = choose_verdict(
-        **squares,
-        left_out=max(0.0, test_error.after**2 - _SURE * base.noise.floor**2)
-        / max(test_error.before**2 - base.noise.floor**2, 1e-30),
-        floor=base.noise.floor**2,
-        structure=inspected,
-        steps=steps,
-        found=found,
+    used, test = measured & ~log.tested & ~outlier, measured & log.tested & ~outlier
+    errors = (_error(samples, before, after, which) for which in (used, test))
+    return Explained(search, start, state, names, outlier, used, test, before, after, *errors)
+
+
+def verdict_on(
+    base: BaseFit, outcome: SearchOutcome, explained: Explained, remaining: ResidualStructure
+) -> VerdictGrounds:
+    """The verdict on what was found, and what remains."""
+    library = _square(outcome.state)
+    floor, error = base.noise.floor, explained.test_error
+    return choose_verdict(
+        base=_square(base.start),
+        library=library,
+        after=min(library, _square(outcome.last)),
+        left_out=max(0.0, error.after**2 - _SURE * floor**2) / max(error.before**2 - floor**2, 1e-30),
+        floor=floor**2,
+        structure=remaining,
+        steps=outcome.steps,
+        found=explained.names,
     )
-    kept = [] if grounds.drop_effects else found
-    final = state if kept else start
+
+
+def assemble(
+    log: SplitLog,
+    base: BaseFit,
+    outcome: SearchOutcome,
+    explained: Explained,
+    remaining: ResidualStructure,
+    grounds: VerdictGrounds,
+) -> Result:
+    """All that the report says."""
+    samples, robot, noise, steps = log.samples, base.robot, base.noise, outcome.steps
+    kept = [] if grounds.drop_effects else [*explained.names]
+    final = explained.state if kept else explained.start
+    before, after, path = explained.before, explained.after, _path(explained, log, base)
+    train_error, test_error = explained.train_error, explained.test_error
     if not kept:
         after = before
         train_error, test_error = (replace(e, after=e.before) for e in (train_error, test_error))
-        test_error = replace(test_error, interval=_interval(samples, before, test))
+        test_error = replace(test_error, interval=_interval(samples, before, explained.test))
         path = path[:1]
     estimates, correlation = _estimates(final)
     classes = _classes(steps, kept)
-    effects = [_effect(name, estimates, classes, path, steps, base.noise.floor) for name in kept]
-    wiring = state.model.wiring
+    effects = [_effect(name, estimates, classes, path, steps, noise.floor) for name in kept]
+    wiring = final.model.wiring
     lacks = (
-        advice.missing_excitation(search.samples, wiring.bend(np.asarray(samples.log.dl)))
+        advice.missing_excitation(explained.search.samples, wiring.bend(np.asarray(samples.log.dl)))
         if wiring.n_tendons
         else []
     )
     recommended = [advice.look_at(pattern) for pattern in grounds.patterns]
     recommended += [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
-    base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept} | fixed
+    base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept}
+    ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
+    say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
     return Result(
         log=samples.log,
         robot=robot,
         identified=final.model.identified(final.theta),
-        held_out=labels,
-        noise=base.noise,
-        measured=measured,
-        used=used,
-        tested=test,
-        outlier=outlier,
+        held_out=log.labels,
+        noise=noise,
+        measured=samples.log.measured,
+        used=explained.used,
+        tested=explained.test,
+        outlier=explained.outlier,
         before=before,
         after=after,
         train=train_error,
         test=test_error,
-        verdict="ambiguous"
-        if grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
-        else grounds.verdict,
-        summary=" ".join(
-            [
-                grounds.summary,
-                *(
-                    _sentences(limits(robot, samples))
-                    if grounds.left > _SAY_LIMITS or not robot.n_tendons
-                    else []
-                ),
-            ]
-        ),
+        verdict="ambiguous" if ambiguous else grounds.verdict,
+        summary=" ".join([grounds.summary, *(_sentences(limits(robot, samples)) if say_limits else [])]),
         effects=effects,
-        base_parameters=base_estimates,
+        base_parameters=base_estimates | base.fixed,
         correlation=correlation,
-        remaining=inspected,
+        remaining=remaining,
         remaining_kind=grounds.kind,
         remaining_fraction=grounds.left,
         patterns=grounds.patterns,
         tried=_tried(steps[0], kept, base) if steps else [],
         path=path,
-        bounds=search.bounds(final),
+        bounds=explained.search.bounds(final),
         advice=advice.unique([*recommended, *lacks]),
-        notes=base.notes,
-        solves=base.rod.runs,
+        notes=[*base.notes, *outcome.notes],
+        solves=base.search.rod.runs,
     )
 
 
-def _nearer(
-    one: ModelState, other: ModelState, samples: LogSamples, rows: Ints, robot: Robot, threads: int | None
-) -> ModelState:
+def _predicted(state: ModelState, piece: LogSamples, base: BaseFit) -> PredictedPose:
+    rod = PredictedRod(piece, base.robot, threads=base.search.rod.threads)
+    return predict(state.model, state.theta, piece, rod)
+
+
+def _nearer(one: ModelState, other: ModelState, piece: LogSamples, base: BaseFit) -> ModelState:
     """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where
     a load makes the rod snap."""
-    piece = samples.on(rows)
 
     def off(state: ModelState) -> float:
-        pose = predict(state.model, state.theta, piece, PredictedRod(piece, robot, threads=threads))
-        error = np.linalg.norm(np.asarray(samples.log.tip_position)[rows] - pose.position, axis=1)
-        return float(
-            np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2)
-        )
+        pose, far = _predicted(state, piece, base), _FAR * base.robot.length
+        error = np.linalg.norm(np.asarray(piece.log.tip_position)[piece.rows] - pose.position, axis=1)
+        return float(np.mean(np.where(pose.ok, np.minimum(error, far), far) ** 2))
 
     return other if off(other) <= off(one) else one
 
 
-def _square(state: ModelState, sigma: Floats) -> float:
+def _square(state: ModelState) -> float:
     """Mean square distance that a state leaves at the samples of the search [m^2]."""
     counted = state.fit.residual[np.any(state.fit.residual != 0.0, axis=1), :3]
-    return float(np.mean(((counted * sigma) ** 2).sum(1))) if len(counted) else 0.0
+    return float(np.mean(((counted * state.linearised.target.sigma) ** 2).sum(1))) if len(counted) else 0.0
 
 
 def _own(state: ModelState, name: str) -> float:
@@ -188,7 +204,7 @@ def _effect(
     estimates: dict[str, Estimate],
     classes: dict[str, list[str]],
     path: list[SearchStage],
-    steps: list[SearchStep],
+    steps: Sequence[SearchStep],
     floor: float,
 ) -> Found:
     parameters = {
@@ -210,7 +226,7 @@ def _effect(
     )
 
 
-def _classes(steps: list[SearchStep], found: list[str]) -> dict[str, list[str]]:
+def _classes(steps: Sequence[SearchStep], found: Sequence[str]) -> dict[str, list[str]]:
     """Effects that explained a stage as well as the one that was taken."""
     return {
         step.taken.name: [r for r in step.rivals if r not in found]
@@ -220,8 +236,7 @@ def _classes(steps: list[SearchStep], found: list[str]) -> dict[str, list[str]]:
 
 
 def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
-    sigma = base.weights[0] if base.weights else base.target.sigma
-    scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((sigma**2).sum()))
+    scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((base.search.target.sigma**2).sum()))
     made = []
     for c in sorted(step.candidates, key=lambda c: (c.state is None, -c.bic_gain)):
         left = float("nan")
@@ -265,15 +280,12 @@ def _estimates(state: ModelState) -> tuple[dict[str, Estimate], tuple[list[str],
     return made, ([u.name for u in state.model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
 
-def _everywhere(
-    model: Model, theta: Floats, samples: LogSamples, robot: Robot, threads: int | None
-) -> Floats:
+def _everywhere(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
     """(n, 3) predicted tip of every driven sample [m]; nan where the rod did not converge."""
     tip = np.full((len(samples.log), 3), np.nan)
     for start in range(0, len(tip), ALL_AT_ONCE):
         rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
-        piece = samples.on(rows)
-        pose = predict(model, theta, piece, PredictedRod(piece, robot, threads=threads))
+        pose = _predicted(state, samples.on(rows), base)
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip
 
@@ -302,34 +314,47 @@ def _interval(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[flo
     return float(low), float(high)
 
 
-def _path(
-    start: ModelState,
-    state: ModelState,
-    found: list[str],
-    samples: LogSamples,
-    robot: Robot,
-    used: Flags,
-    test: Flags,
-    search: Search,
-    threads: int | None,
-) -> list[SearchStage]:
+def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStage]:
     """Error after each effect, added in the order of what each brings."""
 
     def stage(name: str, at: ModelState) -> SearchStage:
-        tip = _everywhere(at.model, at.theta, samples, robot, threads)
+        tip = _everywhere(at, log.samples, base)
         errors = [
-            float(np.sqrt(_distance(samples, tip, which).mean())) if which.any() else float("nan")
-            for which in (used, test)
+            float(np.sqrt(_distance(log.samples, tip, which).mean())) if which.any() else float("nan")
+            for which in (explained.used, explained.test)
         ]
         return SearchStage(name=name, train=errors[0], held_out=errors[1])
 
-    stages = [stage("base", start)]
-    for i in range(1, len(found) + 1):
-        piece = state
-        for name in found[i:]:
-            piece = search.without(piece, name)
-        stages.append(stage(found[i - 1], piece))
+    stages = [stage("base", explained.start)]
+    for i in range(1, len(explained.names) + 1):
+        piece = explained.state
+        for name in explained.names[i:]:
+            piece = explained.search.without(piece, name)
+        stages.append(stage(explained.names[i - 1], piece))
     return stages
+
+
+def limits(robot: Robot, samples: LogSamples) -> list[str]:
+    """Sentences on shear and inertia, which the rod's state does not hold and no effect can carry, where this
+    robot is thick or slow enough for them."""
+    found = []
+    thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
+    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING:
+        found.append(
+            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some "
+            f"{100 * fraction:.0f} % of the deflection"
+        )
+    mass = sum(s.line_density * s.length for s in robot.segments)
+    if mass > 0.0:
+        soft = min(min(s.bending_stiffness) for s in robot.segments)
+        frequency = 0.56 * math.sqrt(soft / (mass * robot.length**3))
+        steps = sorted(samples.dt[samples.dt > 0.0].tolist())
+        if frequency < _SLOW and steps and 2.0 * frequency * steps[len(steps) // 2] < 1.0:
+            found.append(
+                f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a "
+                "static model cannot follow"
+            )
+    return found
 
 
 def _sentences(lines: Sequence[str]) -> list[str]:

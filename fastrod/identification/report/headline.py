@@ -1,4 +1,5 @@
-"""The first screen of the report: verdict, error, what was missing, what cannot be told, what to do next."""
+"""The first screen of the report: verdict, error, what was missing, what cannot be distinguished, what to do
+next."""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ def header(result: Result) -> str:
 
 
 def hero(result: Result) -> str:
-    """The first screen: verdict, error before and after, effects, what cannot be told, what to do."""
+    """The first screen: verdict, error before and after, effects, what cannot be distinguished, what to
+    do."""
     error = f"<h3>Tip error on samples that no fit has seen</h3>{_numbers(result)}{_bars(result)}"
     left, right = [("a", error), ("c", _distinguished(result))], [("b", _found(result))]
     (left if len(result.effects) > 1 else right).append(("d", _next(result)))
@@ -193,7 +195,7 @@ def _distinguished(result: Result) -> str:
             if unseen
             else ["Nothing that the library knows."]
         )
-    return f"<h3>What cannot be told</h3><ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
+    return f"<h3>What cannot be distinguished</h3><ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
 
 
 def _next(result: Result) -> str:

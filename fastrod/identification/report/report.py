@@ -183,7 +183,8 @@ def table(result: Result) -> Group:
             grid.caption_justify = "left"
         blocks.append(grid)
     lines = [
-        f"{words(f.name)} cannot be told from {', '.join(map(words, f.cannot_be_told_from))} on this log"
+        f"{words(f.name)} cannot be distinguished from {', '.join(map(words, f.cannot_be_told_from))} on "
+        "this log"
         for f in result.effects
         if f.cannot_be_told_from
     ]

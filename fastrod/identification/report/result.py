@@ -48,7 +48,7 @@ class Tried:
     kept: bool
     why: str
     kind: str
-    """`effect`, or the kind of a foil."""
+    """`effect`, or the kind of an alternative pattern."""
 
 
 @dataclass(frozen=True, kw_only=True)

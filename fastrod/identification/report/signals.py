@@ -99,7 +99,7 @@ class Signals:
 
     def loops(self) -> SignalView | None:
         """The residual along the bend against the commanded bend, where motion is in one direction; None
-        without wires."""
+        without tendons."""
         best: tuple[float, Floats, Flags, int, float] | None = None
         for k in range(self.bend.shape[1]):
             size = float(np.abs(self.bend[:, k]).max(initial=0.0))

@@ -49,8 +49,8 @@ def choose_verdict(
 ) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
-    `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise
-    that is left."""
+    `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
+    above the noise that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative

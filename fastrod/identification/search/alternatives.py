@@ -1,8 +1,8 @@
 """What no effect of the library is: patterns that a residual may have for reasons outside the model.
 
-Each foil is a few linear columns, some of them found by a scan. They compete with the effects on the same
-terms; where one wins, the verdict is that the cause is not in the library, and of which kind it is. They are
-never part of "after".
+Each alternative pattern is a few linear columns, some of them found by a scan. They compete with the effects
+on the same terms; where one wins, the verdict is that the cause is not in the library, and of which kind it
+is. They are never part of "after".
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _slip(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
             yield AlternativePattern(
                 "slip",
                 "drift",
-                f"the zero of drive {drive + 1} jumps at {_when(linearised, at)}: its wire slipped",
+                f"the zero of drive {drive + 1} jumps at {_when(linearised, at)}: its tendon slipped",
                 columns,
                 2,
             )
@@ -192,7 +192,7 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
         yield AlternativePattern(
             "ripple",
             "static",
-            f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
+            f"periodic in the tendons with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
             _weighted(linearised, np.stack(blocks, axis=-1)),
             1,
         )

@@ -1,4 +1,4 @@
-"""The model near one parameter vector: wires, loads and camera exactly, the rod by its slopes.
+"""The model near one parameter vector: tendons, loads and camera exactly, the rod by its slopes.
 
 A candidate effect changes the rod's inputs by little. So the rod is solved once at a reference, and once for
 each direction that its inputs can take; after that a candidate costs no rod at all. What is accepted is
@@ -7,12 +7,15 @@ solved exactly.
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
+from fastrod.effects.executor import act
 from fastrod.effects.ports import CHANGEABLE
 from fastrod.identification.log.forward import (
     LogSamples,
@@ -24,29 +27,36 @@ from fastrod.identification.log.forward import (
 from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
 from fastrod.identification.search.solve import Fit, minimise
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.types import Flags, Floats
+from fastrod.types import Floats
 
+ANGLE = 0.01
+"""rad, noise of a measured orientation."""
 _BEND = 2e-3  # rad, step of the slopes by bend
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
     """What was measured at the rows, and how much each number counts."""
 
-    def __init__(self, samples: LogSamples, sigma: Floats, *, rotation_sigma: float, points: bool) -> None:
-        log = samples.log.rows(samples.rows)
-        self.tip = np.asarray(log.tip_position)
-        quaternion = log.tip_quaternion
-        self.rotation = (
-            None
-            if quaternion is None or not np.isfinite(quaternion).all()
-            else matrix_from_quaternion(quaternion)
-        )
-        self.points = log.points if points and log.points is not None else np.zeros((len(log), 0, 3))
-        self.seen = np.isfinite(self.points)
-        self.sigma, self.rotation_sigma = sigma, rotation_sigma
-        self.weight = np.ones(len(log))
-        """(n,) 0 for outliers."""
+    tip: Floats
+    """(n, 3) [m]."""
+    rotation: Floats | None
+    """(n, 3, 3)."""
+    points: Floats
+    """(n, k, 3) [m]; nan where one was hidden."""
+    sigma: Floats
+    """(3,) of positions [m]."""
+    rotation_sigma: float
+    """[rad]."""
+    weight: Floats
+    """(n,) 0 for outliers."""
+
+    def weighed(self, sigma: Floats, noise: Floats) -> Target:
+        """Positions count by `sigma` (3,) [m], and orientations as much more or less than by their noise as
+        positions do by theirs, `noise` (3,) [m]: weighed apart, what one of them cannot explain would leave
+        the other to decide alone."""
+        return replace(self, sigma=sigma.copy(), rotation_sigma=ANGLE * float((sigma / noise).max()))
 
     def residual(self, pose: PredictedPose) -> Floats:
         """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not
@@ -57,10 +67,28 @@ class Target:
             blocks.append(_vector(rotation) / self.rotation_sigma)
         if self.points.shape[1]:
             blocks.append(
-                (np.where(self.seen, self.points - pose.points, 0.0) / self.sigma).reshape(len(self.tip), -1)
+                (np.where(np.isfinite(self.points), self.points - pose.points, 0.0) / self.sigma).reshape(
+                    len(self.tip), -1
+                )
             )
         every = np.concatenate(blocks, axis=1)
         return np.asarray(np.where((self.weight > 0.0)[:, None] & pose.ok[:, None], every, 0.0))
+
+
+def target_of(samples: LogSamples, sigma: Floats, *, rotation_sigma: float, points: bool) -> Target:
+    """The measured rows of `samples`, all of which count; with `points` those along the robot too."""
+    log = samples.log.rows(samples.rows)
+    quaternion = log.tip_quaternion
+    return Target(
+        tip=np.asarray(log.tip_position),
+        rotation=None
+        if quaternion is None or not np.isfinite(quaternion).all()
+        else matrix_from_quaternion(quaternion),
+        points=log.points if points and log.points is not None else np.zeros((len(log), 0, 3)),
+        sigma=sigma,
+        rotation_sigma=rotation_sigma,
+        weight=np.ones(len(log)),
+    )
 
 
 def _vector(rotation: Floats) -> Floats:
@@ -104,9 +132,14 @@ class LinearisedModel:
         self.pose = rod.solve(*self.prepared.kernel(self.opened), self.robot)
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
-        light = [each for each, name in zip(self.effects, model.effects, strict=True) if self.is_light(name)]
-        at = self.prepared.drive(light)
+        at = self.prepared.drive([each for each in self.effects if self.is_light(each.name)])
         self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
+
+    def under(self, target: Target) -> LinearisedModel:
+        """The same slopes, weighed otherwise."""
+        made = copy(self)
+        made.target = target
+        return made
 
     def _difference(self, pose: PredictedPose) -> Floats:
         """(n, 6 + 3k) from the reference: tip, rotation vector, points."""
@@ -153,7 +186,7 @@ class LinearisedModel:
         )
 
     def is_light(self, name: str) -> bool:
-        """Whether an effect changes only wire lengths, the tip force or the camera: then no rod need be
+        """Whether an effect changes only tendon lengths, the tip force or the camera: then no rod need be
         solved for it."""
         what = get_effect(name)
         if has_memory(what) or what.seam is Seam.SENSING:
@@ -166,20 +199,17 @@ class LinearisedModel:
     _columns_kind: ClassVar[dict[tuple[str, str], bool]] = {}
 
     def _probe(self, name: str) -> bool:
-        what, opened = get_effect(name), self.prepared.open()
-        unknowns = effect_unknowns(name, self.model.wiring)
-        values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(
-            np.array([u.outside(u.start) for u in unknowns])
-        )[name]
+        opened, unknowns = self.prepared.open(), effect_unknowns(name, self.model.wiring)
+        alone = Model(self.model.robot, self.model.wiring, (name,), unknowns)
+        (one,) = effects_at(alone, alone.start)
         before = {
             key: getattr(opened, key).copy()
             for key in CHANGEABLE
             if key not in ("tendon_length", "tip_force")
         }
-        what.apply(
-            np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0
-        )
-        return all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
+        act([one.on(len(opened))], opened)
+        same = all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
+        return same and not opened.point_forces
 
     def _is_light(self, unknown: Unknown) -> bool:
         return unknown.place[0] == "effect" and self.is_light(unknown.place[1])
@@ -213,13 +243,8 @@ class LinearisedModel:
         return self._columns[unknown.place]
 
     def driven(self, model: Model, theta: Floats) -> Floats:
-        """(n, 6 + 3k) change of the true pose by wires and tip forces."""
-        light = [
-            each
-            for each, name in zip(effects_at(model, theta), model.effects, strict=True)
-            if self.is_light(name)
-        ]
-        opened = self.prepared.drive(light)
+        """(n, 6 + 3k) change of the true pose by tendons and tip forces."""
+        opened = self.prepared.drive([each for each in effects_at(model, theta) if self.is_light(each.name)])
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():
@@ -246,7 +271,7 @@ class LinearisedModel:
         """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
         points [m], base frame."""
         rotation = self.pose.rotation
-        sensing = [each for each in effects_at(model, theta) if each[0].seam is Seam.SENSING]
+        sensing = [each for each in effects_at(model, theta) if each.effect.seam is Seam.SENSING]
         if sensing or self.target.rotation is not None:
             rotation = _turned(rotation, change[:, 3:6])
         points = self.pose.points + change[:, 6:].reshape(self.pose.points.shape)
@@ -264,7 +289,7 @@ class LinearisedModel:
         """(n, n_out, p) of the prediction, by differences that run only what an unknown moves."""
         driven, solved = self.driven(model, theta), self.solved(model, theta)
         J = np.empty((*residual.shape, len(theta)))
-        low, high = model.limits
+        _, high = model.limits
         for j, unknown in enumerate(model.unknowns):
             step = 1e-4 if unknown.log else 1e-3 * unknown.scale
             if unknown.shape or (unknown.place[0] == "effect" and has_memory(get_effect(unknown.place[1]))):
@@ -281,7 +306,6 @@ class LinearisedModel:
             elif get_effect(unknown.place[1]).seam is not Seam.SENSING:
                 change = self.driven(model, moved) + solved
             J[..., j] = (residual - self.target.residual(self.seen(model, moved, change))) / step
-        assert low.shape == high.shape
         return J
 
     def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
@@ -297,13 +321,3 @@ class LinearisedModel:
             model.limits,
             iterations,
         )
-
-
-def exact_residual(
-    model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, target: Target
-) -> tuple[Floats, Flags]:
-    """(n, n_out) weighted residual with the rod solved, and (n,) which rows converged."""
-    from fastrod.identification.log.forward import predict
-
-    pose = predict(model, theta, samples, rod)
-    return target.residual(pose), pose.ok

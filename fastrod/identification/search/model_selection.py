@@ -29,26 +29,26 @@ class ModelState:
     model: Model
     linearised: LinearisedModel
     fit: Fit
-    """Of the unknowns, then of the accepted foils' amplitudes."""
+    """Of the unknowns, then of the accepted alternative patterns' amplitudes."""
     losses: Floats
     """(N_BLOCKS,) held out."""
     alternatives: tuple[AlternativePattern, ...] = ()
 
     @property
     def theta(self) -> Floats:
-        """(p,) fitted numbers of the model's unknowns, without the foils' amplitudes."""
+        """(p,) fitted numbers of the model's unknowns, without the alternative patterns' amplitudes."""
         return self.fit.theta[: len(self.model.unknowns)]
 
     @property
     def columns(self) -> Floats:
-        """(n, n_out, k) of the accepted foils."""
+        """(n, n_out, k) of the accepted alternative patterns."""
         shape = (*self.fit.residual.shape, 0)
         return np.concatenate([np.zeros(shape), *(f.columns for f in self.alternatives)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An effect, or a foil, beside a state."""
+    """An effect, or an alternative pattern, beside a state."""
 
     name: str
     state: ModelState | None

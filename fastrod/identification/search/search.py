@@ -1,14 +1,14 @@
 """The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has
 not seen, keep the best, ask again.
 
-Every candidate starts from the same reference, weights and outlier mask. Foils (`alternatives`) compete on
-the same terms.
+Every candidate starts from the same reference, weights and outlier mask. Alternative patterns
+(`alternatives`) compete on the same terms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -40,7 +40,15 @@ from fastrod.identification.search.model_selection import (
     unphysical,
     z_between,
 )
-from fastrod.identification.search.solve import Fit, bic, effective_size, held_out_losses, minimise, paired
+from fastrod.identification.search.solve import (
+    Fit,
+    bic,
+    effective_size,
+    held_out_losses,
+    minimise,
+    paired,
+    rms,
+)
 from fastrod.types import Floats, Ints
 
 N_BLOCKS = 20
@@ -52,15 +60,17 @@ _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
-_ALTERNATIVE_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
+# of an alternative pattern's amplitude, in units of its own columns' size that would explain all
+_ALTERNATIVE_SD = 30.0
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Search:
     """Samples, weights and blocks that all candidates share."""
 
     samples: LogSamples
     rod: PredictedRod
+    """Stays warm from solve to solve, and counts them; all else is fixed."""
     target: Target
     block: Ints
     """(n,) number of each row's block, 0 to N_BLOCKS - 1; one block at a time is held out."""
@@ -70,9 +80,7 @@ class Search:
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
         from there ends."""
-        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
-        fit = self._fit(linearised, model, theta, np.zeros((0,)), (), iterations)
-        return self.refined(self._state(model, linearised, fit, ()))
+        return self.refined(self._fitted(model, theta, np.zeros(0), (), iterations))
 
     def refined(self, state: ModelState, iterations: int = 4) -> ModelState:
         """The same with the rod solved at the state's own parameters."""
@@ -89,18 +97,32 @@ class Search:
             return state
         return self._state(state.model, linearised, fit, state.alternatives)
 
+    def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
+        """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
+        [m], and the search with these: what a model does not explain yet must not push its parameters beyond
+        their priors."""
+        sigma = self.target.sigma
+        size = max(rms(state.fit.residual), float((noise / sigma).max()))
+        search = replace(self, target=self.target.weighed(sigma * size, noise))
+        return search, search.refined(search.refined(state))
+
     def again(self, state: ModelState) -> ModelState:
-        """A state of other samples, fitted to these; foils, which belong to their samples, are left
-        behind."""
-        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
-        return self.refined(
-            self._state(
-                state.model,
-                linearised,
-                self._fit(linearised, state.model, state.theta, np.zeros(0), (), 6),
-                (),
-            )
-        )
+        """A state of other samples, fitted to these; alternative patterns, which belong to their samples, are
+        left behind."""
+        return self.refined(self._fitted(state.model, state.theta, np.zeros(0), (), 6))
+
+    def _fitted(
+        self,
+        model: Model,
+        theta: Floats,
+        amplitudes: Floats,
+        found: tuple[AlternativePattern, ...],
+        iterations: int,
+    ) -> ModelState:
+        """The state at the best parameters near `theta` (p,), where the rod is solved."""
+        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(linearised, model, theta, amplitudes, found, iterations)
+        return self._state(model, linearised, fit, found)
 
     def _state(
         self, model: Model, linearised: LinearisedModel, fit: Fit, found: tuple[AlternativePattern, ...]
@@ -117,7 +139,8 @@ class Search:
         found: Sequence[AlternativePattern],
         iterations: int,
     ) -> Fit:
-        """The best parameters near `linearised`, with the amplitudes of foils as further linear unknowns."""
+        """The best parameters near `linearised`, with the amplitudes of alternative patterns as further
+        linear unknowns."""
         n = len(model.unknowns)
         mean, sd = model.prior
         low, high = model.limits
@@ -157,36 +180,17 @@ class Search:
         """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
         its passes."""
         if self.spent:
-            return Candidate(
-                name, None, 0.0, 0.0, 0.0, 0, "not tried: the model hardly converges on this log"
-            )
+            return _unfitted(name, "not tried: the model hardly converges on this log")
         drop = self._unseen(state, name)
-        every = state.model.with_effect(name)
-        added = every.unknowns[len(state.model.unknowns) :]
-        labels = [u.name.partition(".")[2] for u in added]
-        sizes = [label for label, u in zip(labels, added, strict=True) if not u.shape]
-        if all(label in drop for label in sizes):
-            return Candidate(
-                name,
-                None,
-                0.0,
-                0.0,
-                0.0,
-                0,
-                "this log does not excite it: " + (trait(get_effect(name), "excited_by") or "no response"),
-            )
+        added = state.model.with_effect(name).unknowns[len(state.model.unknowns) :]
+        if all(u.name.partition(".")[2] in drop for u in added if not u.shape):
+            shown_by = trait(get_effect(name), "excited_by") or "no response"
+            return _unfitted(name, f"this log does not excite it: {shown_by}")
         model = state.model.with_effect(name, drop=drop)
         fits = self._from_starts(state, model, name)
         if fits is None:
-            return Candidate(
-                name,
-                None,
-                0.0,
-                0.0,
-                0.0,
-                len(model.unknowns) - len(state.model.unknowns),
-                "its slopes promise nothing",
-            )
+            n_more = len(model.unknowns) - len(state.model.unknowns)
+            return _unfitted(name, "its slopes promise nothing", n_more)
         return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
     def _unseen(self, state: ModelState, name: str) -> list[str]:
@@ -228,7 +232,6 @@ class Search:
         combos = list(product(*grouped))[: 2 * _STARTS]
         combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
         amplitudes = state.fit.theta[n:]
-        best: Fit | None = None
         promising = []
         for combo in combos:
             pick = dict(zip(grouped, combo, strict=True))
@@ -241,32 +244,23 @@ class Search:
                     ],
                 ]
             )
-            promise = self._promise(state, model, theta)
-            promising.append((promise, theta))
+            promising.append((self._promise(state, model, theta), theta))
         promising.sort(key=lambda pair: -pair[0])
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
-        for _, theta in promising[:3]:
-            fit = self._fit(linearised, model, theta, amplitudes, state.alternatives, _FEW)
-            if best is None or fit.loss < best.loss:
-                best = fit
-        assert best is not None
-        return self._fit(
-            linearised,
-            model,
-            best.theta[: len(model.unknowns)],
-            best.theta[len(model.unknowns) :],
-            state.alternatives,
-            _MANY,
-        )
+        fits = [
+            self._fit(linearised, model, theta, amplitudes, state.alternatives, _FEW)
+            for _, theta in promising[:3]
+        ]
+        best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
+        return self._fit(linearised, model, best, amplitudes, state.alternatives, _MANY)
 
     def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
         """Loss that the response to the new parameters could take away at best, beside what the others can
         absorb."""
         n = len(state.model.unknowns)
-        at = state.linearised.residual(model, theta) - (
-            state.columns @ state.fit.theta[n:] if state.alternatives else 0.0
-        )
+        patterns = state.columns @ state.fit.theta[n:] if state.alternatives else 0.0
+        at = state.linearised.residual(model, theta) - patterns
         # the response at the start itself: operators have no slope at neutral
         shift = (state.fit.residual - at).reshape(-1, 1)
         base = state.fit.slopes.reshape(shift.shape[0], state.fit.slopes.shape[-1])
@@ -278,13 +272,7 @@ class Search:
             for j in sizes:
                 moved = neutral.copy()
                 moved[j] = model.unknowns[j].mean
-                columns.append(
-                    (
-                        state.linearised.residual(model, moved)
-                        - (state.columns @ state.fit.theta[n:] if state.alternatives else 0.0)
-                        - at
-                    ).ravel()
-                )
+                columns.append((state.linearised.residual(model, moved) - patterns - at).ravel())
             J = np.concatenate([J, np.stack(columns, axis=1)], axis=1)
         r = state.fit.residual.ravel()
         gram = J.T @ J + np.diag(
@@ -317,7 +305,7 @@ class Search:
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
     def alternative_candidates(self, state: ModelState) -> list[Candidate]:
-        """The best foil of each family beside a state, linear in everything."""
+        """The best alternative pattern of each family beside a state, linear in everything."""
         made = []
         for alternative in alternatives(state.linearised, state.fit.slopes, state.fit.residual):
             # a row without a shape tells nothing
@@ -371,8 +359,8 @@ class Search:
         return self.choose(state, tried, with_alternatives=with_alternatives)
 
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
-        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it
-        clearly."""
+        """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
+        they beat it clearly."""
         fitted = sorted(
             (c for c in tried if c.state is not None and c.z > 1.0 and c.fraction > FRACTION_ACCEPT),
             key=lambda c: -c.fraction,
@@ -432,28 +420,22 @@ class Search:
         return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
 
     def bare(self, state: ModelState) -> ModelState:
-        """`state` without its foils, fitted again: what the library alone explains."""
-        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
-        fit = self._fit(linearised, state.model, state.theta, np.zeros(0), (), 8)
-        return self._state(state.model, linearised, fit, ())
+        """`state` without its alternative patterns, fitted again: what the library alone explains."""
+        return self._fitted(state.model, state.theta, np.zeros(0), (), 8)
 
     def without(self, state: ModelState, name: str) -> ModelState:
         """`state` without one of its effects, fitted again."""
         model = state.model.without(name)
         kept = [j for j, u in enumerate(state.model.unknowns) if u.place[:2] != ("effect", name)]
-        theta = state.theta[kept]
-        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
-        fit = self._fit(
-            linearised, model, theta, state.fit.theta[len(state.model.unknowns) :], state.alternatives, 8
-        )
-        return self._state(model, linearised, fit, state.alternatives)
+        amplitudes = state.fit.theta[len(state.model.unknowns) :]
+        return self._fitted(model, state.theta[kept], amplitudes, state.alternatives, 8)
 
     def eliminated(
         self, state: ModelState, found: Sequence[str], least: float, noise: float
     ) -> tuple[ModelState, list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where
         what is left is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant
-        effect they only mend its form. The state, and who is left."""
+        effect they only correct its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, ModelState] | None = None
@@ -525,3 +507,25 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _unfitted(name: str, why: str, n_parameters: int = 0) -> Candidate:
+    return Candidate(name, None, 0.0, 0.0, 0.0, n_parameters, why)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SearchOutcome:
+    """What a search found in the residual of the base model."""
+
+    search: Search
+    """With the weights of the last fit."""
+    start: ModelState
+    """Without any of it, weighed as `search` does."""
+    last: ModelState
+    """With alternative patterns."""
+    state: ModelState
+    """With the effects alone."""
+    names: tuple[str, ...]
+    """Of these effects."""
+    steps: tuple[SearchStep, ...]
+    notes: tuple[str, ...] = ()

@@ -147,6 +147,12 @@ def effective_size(residual: Floats) -> float:
     return max(residual.size * (1.0 - rho) / (1.0 + rho), 4.0)
 
 
+def rms(residual: Floats) -> float:
+    """Root mean square of a residual (n, n_out), rows that do not count left out."""
+    counted = residual[np.any(residual != 0.0, axis=1)]
+    return float(np.sqrt(np.mean(counted**2))) if counted.size else 0.0
+
+
 def bic(loss: float, n_parameters: int, size: float) -> float:
     """Bayesian information criterion with the error's size unknown, for `size` effective samples."""
     return size * float(np.log(max(loss, 1e-300))) + n_parameters * float(np.log(size))

@@ -122,7 +122,7 @@ class DualArm(HostedTask):
                 "",
                 (0.0,) * 4,
                 (1.0,) * 4,
-                "the first and the second told to hold; the first and the second hold the ball",
+                "the first and the second commanded to hold; the first and the second hold the ball",
             ),
             Field(
                 "posture",
@@ -346,7 +346,7 @@ class _Pair(Cell):
             head.place(*pose)
 
     def _take(self) -> None:
-        """Heads that are told to hold, and touch the ball, hold it."""
+        """Heads that are commanded to hold, and touch the ball, hold it."""
         for k, head in enumerate(self.heads):
             if self.commanded[k] and not self.held[k] and head.attach(()) is not None:
                 self.held[k] = True

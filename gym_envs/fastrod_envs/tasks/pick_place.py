@@ -137,7 +137,7 @@ class PickPlace(HostedTask):
                 "",
                 (0.0, 0.0, 0.0),
                 (1.0, 1.0, 1.0),
-                "told to hold; opening of the fingers, 0 closed; the cube is held",
+                "commanded to hold; opening of the fingers, 0 closed; the cube is held",
             ),
         )
         super().__init__(n_envs, options, soft_robot("picker", 2, line_density=0.03), actions, states, goals)

@@ -1,5 +1,4 @@
-"""Robots beside, along and against a mesh: inputs of the contact benchmark, and FCL's answer, capsule by
-capsule."""
+"""Robots beside, along and against a mesh: inputs and times of the contact benchmark, and FCL's answer."""
 
 from __future__ import annotations
 
@@ -19,35 +18,24 @@ from fastrod.contact.geometry import Obstacle
 from report import Measurement, best
 
 ROBOT = "five_segment_reacher"
-POINTS = 6
-"""Intervals of a segment: 30 of a robot, each one sample of contact."""
-RADIUS = 0.12
-"""Of the ball that the meshes approximate [m]."""
-N_CYCLE = 12
-"""Steps in which the tendons swing once around; the timed steps are one cycle."""
-SWING = 1.5e-3
-"""Bend that each segment gains and loses in a cycle, either side [rad]: the tip goes about 1 mm a step."""
+POINTS = 6  # intervals of a segment: 30 of a robot, each one sample of contact
+RADIUS = 0.12  # m, of the ball that the meshes approximate
+N_CYCLE = 12  # steps in which the tendons swing once around; the timed steps are one cycle
+SWING = 1.5e-3  # rad of bend that each segment gains and loses in a cycle: the tip goes about 1 mm a step
 FAR, GRAZING, PRESSED = 0.4, 2e-3, -3e-3
-"""Smallest gap between mesh and free rod over a cycle, negative: the overlap that the mesh then prevents
-[m]."""
-_APPROACH, _AWAY = 8, 0.03
-"""Steps in which the mesh comes to its place, and how much farther off it begins [m]."""
-_WARM = 1
-"""Steps before the timed ones."""
+"""Smallest gap between mesh and free rod over a cycle; negative: the overlap that the mesh prevents [m]."""
+_APPROACH, _AWAY = 8, 0.03  # steps in which the mesh comes to its place, m that it begins farther off
+_WARM = 1  # steps before the timed ones
 
 
 @dataclass(frozen=True)
 class Batch:
     """Robots that move, and a place for a mesh beside each."""
 
-    tendon_length: Array
-    """(N_CYCLE, n_robots, n_tendons) of each step of a cycle [m]."""
-    node: Array
-    """(N_CYCLE, n_robots, n_points, 3) of the free robots [m]."""
-    beside: Array
-    """(n_robots, 3) point on the rod that the mesh comes nearest to [m]."""
-    out: Array
-    """(n_robots, 3) unit, from there toward the centre of the mesh."""
+    tendon_length: Array  # (N_CYCLE, n_robots, n_tendons) of each step of a cycle [m]
+    node: Array  # (N_CYCLE, n_robots, n_points, 3) of the free robots [m]
+    beside: Array  # (n_robots, 3) point on the rod that the mesh comes nearest to [m]
+    out: Array  # (n_robots, 3) unit, from there toward the centre of the mesh
     rod_radius: float
 
     @property
@@ -70,12 +58,11 @@ def make_batch(n: int) -> Batch:
         lengths.append(arc_lengths(robot, rest + swing))
         state = sim.settle(lengths[-1]) if k == 0 else sim.step(lengths[-1])
         nodes.append(state.position)
-    node = np.stack(nodes)
     # the end of the fourth segment
     beside, tangent = state.position[:, 4 * POINTS], state.rotation[:, 4 * POINTS, :, 2]
     out = np.cross(tangent, rng.normal(size=(n, 3)))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
-    return Batch(np.stack(lengths), node, beside, out, robot.segments[0].body_radius)
+    return Batch(np.stack(lengths), np.stack(nodes), beside, out, robot.segments[0].body_radius)
 
 
 def make_mesh(subdivisions: int) -> Obstacle:
@@ -87,8 +74,7 @@ def make_mesh(subdivisions: int) -> Obstacle:
 
 
 def places(batch: Batch, gap: float) -> Array:
-    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of the whole cycle; by
-    bisection."""
+    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of a cycle; by bisection."""
     near, far = np.full(len(batch.out), -0.1), np.full(len(batch.out), 0.5 + gap)
     wanted = gap + batch.rod_radius + RADIUS
     for _ in range(50):
@@ -105,22 +91,16 @@ class Timed:
     """One batch in one state."""
 
     n_faces: int
-    step_s: float
-    """Mean of the timed steps, each the best of its rounds [s]."""
-    touching: float
-    """Fraction of robot-steps in contact."""
-    contacts: float
-    """Mean of a robot-step."""
+    step_s: float  # mean of the timed steps, each the best of its rounds
+    touching: float  # fraction of robot-steps in contact
+    contacts: float  # mean of a robot-step
     passes: float
     most_passes: int
-    gap: float
-    """Median over robots of the smallest gap after the last step [m]; a lower bound where the mesh is far."""
-    not_ok: int
-    """Robot-steps that were not ok, the approach included."""
+    gap: float  # m, median over robots of the smallest after the last step; a lower bound far off
+    not_ok: int  # robot-steps, the approach included
     sim: Simulator
     last: State
-    earlier: tuple[Any, ...]
-    """Shape and clearance that the last step began from."""
+    earlier: tuple[Any, ...]  # shape and clearance that the last step began from
 
 
 def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budget: float) -> Timed:
@@ -141,28 +121,26 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
     states += [sim.step(length[k]) for k in range(1, _WARM + 1)]
     not_ok = sum(int((~state.ok).sum()) for state in states)
     taken, passes = [Measurement() for _ in range(N_CYCLE)], []
-    touching, contacts, k, earlier = [0.0], [0.0], _WARM, ()
+    touching, contacts, k, earlier = [], [], _WARM, ()
     while sum(sum(each.times) for each in taken) < budget or k < _WARM + 3:
         k += 1
         engine = sim._engine
-        earlier = () if engine is None else (engine.before, *(a.copy() for a in engine.clearance))
+        earlier = () if engine is None else (engine.before, _copied(engine.clearance))
         state = taken[k % N_CYCLE].take(partial(sim.step, length[k % N_CYCLE]))
         not_ok += int((~state.ok).sum())
         passes.append(state.passes[state.ok])
         if state.contacts is not None:
             touching.append(state.contacts.in_contact().mean())
             contacts.append(state.contacts.count.mean())
-    nearest = math.nan if state.contacts is None else float(np.nanmedian(state.contacts.clearance))
-    fraction, mean = (float(np.mean(a[1:] or a)) for a in (touching, contacts))
     each = np.concatenate(passes)
     return Timed(
         n_faces=0 if obstacle is None else len(obstacle.faces),
         step_s=float(np.nanmean([one.least for one in taken])),
-        touching=fraction,
-        contacts=mean,
+        touching=float(np.mean(touching or 0.0)),
+        contacts=float(np.mean(contacts or 0.0)),
         passes=float(each.mean()),
         most_passes=int(each.max()),
-        gap=nearest,
+        gap=math.nan if state.contacts is None else float(np.nanmedian(state.contacts.clearance)),
         not_ok=not_ok,
         sim=sim,
         last=state,
@@ -170,25 +148,28 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
     )
 
 
-def query(timed: Timed, repeats: int) -> tuple[float, float]:
+def query(timed: Timed, repeats: int) -> list[float]:
     """Seconds of one search of all robots against their meshes: with nothing known, and from what the step
     before knew."""
     engine: Any = timed.sim._engine
-    before, distance, position = timed.earlier
-    shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
-    rows, clearance = np.arange(timed.sim.n_robots), engine.clearance
-    kept = engine.before, engine.gap.copy(), *(a.copy() for a in clearance)
-    engine.before, found = before, []
+    before, clearance = timed.earlier
+    rows, kept, found = np.arange(timed.sim.n_robots), engine.snapshot(), []
+    engine.before, shape = before, timed.last.as_shape()
     for cold in (True, False):
         searched = Measurement()
         for _ in range(repeats):
-            clearance.distance[:] = -np.inf if cold else distance
-            clearance.position[:] = position
+            engine.clearance = _copied(clearance)
+            if cold:
+                engine.clearance.distance[:] = -np.inf
             engine.tracked[:] = not cold  # what has no past has gone through nothing
-            searched.take(partial(engine.touches, rows, shape))
+            searched.take(partial(engine.overlap, rows, shape))
         found.append(searched.least)
-    engine.before, engine.gap[:], clearance.distance[:], clearance.position[:] = kept
-    return found[0], found[1]
+    engine.restore(kept)
+    return found
+
+
+def _copied(clearance: Any) -> Any:
+    return type(clearance)(*(a.copy() for a in clearance))
 
 
 def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]) -> list[tuple[Any, ...]]:
@@ -204,8 +185,15 @@ def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]
     for i in rows:
         ball = fcl.CollisionObject(model, fcl.Transform(pose[i, 3:], pose[i, :3]))
         for a, b in pairwise(timed.last.position[i]):
-            request = fcl.DistanceRequest(enable_nearest_points=True)
-            found.append((ball, _capsule(fcl, a, b), request, fcl.DistanceResult()))
+            length = float(np.linalg.norm(b - a))
+            z = (b - a) / length  # a capsule's axis in its own frame
+            x = np.cross(z, (1.0, 0.0, 0.0) if abs(z[0]) < 0.6 else (0.0, 1.0, 0.0))
+            x /= np.linalg.norm(x)
+            place = fcl.Transform(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a + b))
+            capsule = fcl.CollisionObject(fcl.Capsule(1e-6, length), place)
+            found.append(
+                (ball, capsule, fcl.DistanceRequest(enable_nearest_points=True), fcl.DistanceResult())
+            )
     return found
 
 
@@ -222,14 +210,3 @@ def fcl_seconds(timed: Timed, obstacle: Obstacle, pose: Array, n_robots: int) ->
     queries = questions(timed, obstacle, pose, rows)
     ask_fcl(queries)
     return best(partial(ask_fcl, queries), 2) / len(rows), len(rows)
-
-
-def _capsule(fcl: Any, a: Array, b: Array) -> Any:
-    """From a to b, the axis of the shape's own frame being z."""
-    length = float(np.linalg.norm(b - a))
-    z = (b - a) / length
-    x = np.cross(z, (1.0, 0.0, 0.0) if abs(z[0]) < 0.6 else (0.0, 1.0, 0.0))
-    x /= np.linalg.norm(x)
-    return fcl.CollisionObject(
-        fcl.Capsule(1e-6, length), fcl.Transform(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a + b))
-    )

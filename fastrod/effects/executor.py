@@ -1,0 +1,105 @@
+"""The one executor of effects, at their seams in order: of a batch of robots at one step, or of the samples
+of a log.
+
+Where rows are robots, `act` moves memories on by one step. Where they are samples in the order of time, `act`
+is for effects without memory, and `sweep` carries a memory over whole runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fastrod.effects.base import Effect, Seam, get_effect
+from fastrod.effects.ports import EffectPorts
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Floats
+
+
+class SensedPoses(NamedTuple):
+    """What a camera on the base sees of the tip, effects of sensing included; base frame."""
+
+    tip_position: Floats
+    """(n_robots, 3) [m]."""
+    tip_rotation: Floats
+    """(n_robots, 3, 3) base_from_tip."""
+    points: Floats
+    """(n_robots, k, 3) at the robot's `log_points` [m]; k is 0 with outputs="tip"."""
+
+
+class Link(NamedTuple):
+    """One effect over the rows of the ports."""
+
+    name: str
+    effect: Effect
+    values: Floats
+    """(n, n_columns)."""
+    memory: Floats
+    """(n, m)."""
+
+    def on(self, n: int) -> Link:
+        """The same effect, which has no memory and one row of values, over `n` rows."""
+        return self._replace(
+            values=np.broadcast_to(self.values, (n, self.values.shape[1])), memory=np.empty((n, 0))
+        )
+
+
+def at_rest(what: Effect, n: int, n_tendons: int) -> Floats:
+    """(n, m) memory of an effect at the start; m is 0 without one."""
+    memory = what.memory(n, n_tendons)
+    return np.empty((n, 0)) if memory.size == 0 else memory
+
+
+def link(name: str, values: Floats, n_tendons: int) -> Link:
+    """The effect of this name at rest, with `values` (n, n_columns)."""
+    what = get_effect(name)
+    return Link(name, what, values, at_rest(what, len(values), n_tendons))
+
+
+def act(links: Iterable[Link], opened: EffectPorts, state: Any = None, dt: float = 0.0) -> None:
+    """Let the effects before the camera change `opened`; memories move on by `dt` [s]. `state`: the last one
+    of a simulator."""
+    opened.state = state
+    for each in links:
+        if each.effect.seam is not Seam.SENSING:
+            each.effect.apply(each.values, each.memory, opened, state, dt)
+
+
+def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> None:
+    """Let an effect with a memory change the tendon lengths of `opened`, whose rows are the samples of
+    `runs`, each from rest; `dt` (n,) is the time before each sample [s]."""
+    rest, out, dl = opened.rest_length, np.empty_like(opened.tendon_length), opened.dl
+    for span in runs:
+        memory = one.memory.copy()
+        if hasattr(one.effect, "sweep"):
+            out[span] = one.effect.sweep(one.values, memory, dl[None, span], dt[span], opened.routing)[0]
+            continue
+        for i in range(span.start, span.stop):  # one sample after the other, slowly
+            row = opened.rows(slice(i, i + 1))
+            row.tendon_length = dl[i : i + 1] + rest
+            one.effect.apply(one.values, memory, row, None, float(dt[i]))
+            out[i] = row.dl[0]
+    opened.shift_tendons(out - dl)
+
+
+def sense(links: Iterable[Link], opened: EffectPorts, seen: SensedPoses, dt: float = 0.0) -> SensedPoses:
+    """`seen` as the camera has it, with the effects of sensing."""
+    opened.tip_position, opened.tip_rotation, opened.points = (a.copy() for a in seen)
+    for each in links:
+        if each.effect.seam is Seam.SENSING:
+            each.effect.apply(each.values, each.memory, opened, None, dt)
+    return SensedPoses(opened.tip_position, opened.tip_rotation, opened.points)
+
+
+def from_base(base_pose: Floats, position: Floats, rotation: Floats, points: Floats) -> SensedPoses:
+    """World poses in the base frame: tip (n, 3) [m] and (n, 3, 3), and `points` (n, k, 3) less the base's
+    position [m]. `base_pose` has n rows or one."""
+    pose = np.broadcast_to(base_pose, (len(position), 7))
+    base = matrix_from_quaternion(pose[:, 3:])
+    return SensedPoses(
+        np.einsum("nji,nj->ni", base, position - pose[:, :3]),
+        np.swapaxes(base, 1, 2) @ rotation,
+        np.einsum("nji,nkj->nki", base, points),
+    )
