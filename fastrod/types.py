@@ -147,8 +147,9 @@ class Surfaces(NamedTuple):
     """The obstacles of a contact scene, each in its own frame; triangles of all meshes stand in the order of
     their hierarchies' leaves."""
 
-    kind: Ints
-    """(n_obstacles,) mesh, sphere, box, ...: the codes of `kernels.primitive`."""
+    primitive: Ints
+    """(n_obstacles, 2) addresses, in this process, of the compiled distance and curvature of a simple shape
+    (`kernels.contact.primitive`); 0 for a mesh."""
     size: Floats
     """(n_obstacles, 3) of a simple shape [m]."""
     sphere: Floats

@@ -19,36 +19,25 @@ asked follows from measurements against brute force (python-fcl 0.7):
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fastrod.contact.geometry import Obstacle, Triple
-from fastrod.contact.normals import (
-    EDGE_AB,
-    EDGE_BC,
-    EDGE_CA,
-    FACE,
-    VERTEX_A,
-    VERTEX_B,
-    VERTEX_C,
-    pseudonormals,
-)
+from fastrod.contact.closest import Triple, along, lowest, on_triangle, segment_triangle
+from fastrod.contact.geometry import Obstacle
+from fastrod.contact.normals import pseudonormals
+from fastrod.contact.primitive import primitive_of
 from fastrod.errors import InputError
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
-
-Signed: TypeAlias = tuple[float, Triple]
-"""Signed distance [m] and its gradient, in the frame of the obstacle."""
 
 _AT_SURFACE = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
 _NUDGE: Floats = 1e-11 * np.array([0.31, 0.57, 0.76])
 """Per length, in a direction that no face is likely to have: takes a segment out of being exactly parallel to
 one."""
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 class Closest(NamedTuple):
@@ -170,7 +159,7 @@ class DirectScene:
         mesh = self._meshes[k]
         if mesh is None:
             obstacle = self.obstacles[k]
-            distance, gradient = _SIGNED[obstacle.shape](_triple(local), obstacle.size)
+            distance, gradient = primitive_of(obstacle.shape).plain(obstacle.size, _triple(local))
             normal = rotation @ np.array(gradient)
             return Closest(distance, normal, world - distance * normal, -1)
         fcl = _fcl()
@@ -178,7 +167,7 @@ class DirectScene:
         dot = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(local * mesh.scale))
         fcl.distance(mesh.body, dot, fcl.DistanceRequest(), answer)
         face = int(answer.b1)
-        nearest, feature = _on_triangle(_triple(local), *mesh.corners[face])
+        nearest, feature = on_triangle(_triple(local), *mesh.corners[face])
         away = local - np.array(nearest)
         outward = mesh.normals[face, feature]
         distance = math.copysign(math.hypot(*away), float(away @ outward))
@@ -194,17 +183,16 @@ class DirectScene:
         p, q = rotation.T @ (start - at), rotation.T @ (end - at)
         mesh = self._meshes[k]
         if mesh is None:
-            obstacle = self.obstacles[k]
-            signed, size = _SIGNED[obstacle.shape], obstacle.size
-            fraction = _lowest(obstacle, p, q)
-            distance, gradient = signed(_triple(p + fraction * (q - p)), size)
+            fraction = _lowest(self.obstacles[k], p, q)
+            size, signed = self.obstacles[k].size, primitive_of(self.obstacles[k].shape).plain
+            distance, gradient = signed(size, _triple(p + fraction * (q - p)))
             on_segment = start + fraction * (end - start)
             return SegmentClosest(
                 distance, on_segment - distance * (rotation @ np.array(gradient)), on_segment, fraction, -1
             )
         found = []
         for face in {mesh.face_near(p, q), mesh.face_near(p, q + math.dist(p, q) * _NUDGE)}:
-            fraction, nearest = _segment_triangle(_triple(p), _triple(q), *mesh.corners[face])
+            fraction, nearest = segment_triangle(_triple(p), _triple(q), *mesh.corners[face])
             found.append((math.dist(p + fraction * (q - p), nearest), face, fraction, nearest))
         distance, face, fraction, nearest = min(found)
         return SegmentClosest(
@@ -230,176 +218,10 @@ def _triple(v: Floats) -> Triple:
     return x, y, z
 
 
-def _dot(a: Triple, b: Triple) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _sub(a: Triple, b: Triple) -> Triple:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-def _cross(a: Triple, b: Triple) -> Triple:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _along(a: Triple, d: Triple, t: float) -> Triple:
-    return a[0] + t * d[0], a[1] + t * d[1], a[2] + t * d[2]
-
-
-def _on_triangle(p: Triple, a: Triple, b: Triple, c: Triple) -> tuple[Triple, int]:
-    """The point of a triangle closest to p, and the feature that it lies on, counted as in `pseudonormals`.
-
-    The weights of the corners (barycentric coordinates) of p's projection tell the region (Ericson 2005,
-    5.1.5).
-    """
-    ab, ac, ap = _sub(b, a), _sub(c, a), _sub(p, a)
-    bp, cp = _sub(p, b), _sub(p, c)
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return a, VERTEX_A
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        return b, VERTEX_B
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        return c, VERTEX_C
-    # areas by cross products with an edge: d1 d4 - d3 d2 and its like lose digits far from the triangle
-    n = _cross(ab, ac)
-    wc = _dot(n, _cross(ab, ap))
-    if wc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return _along(a, ab, d1 / (d1 - d3)), EDGE_AB
-    wb = _dot(n, _cross(ap, ac))
-    if wb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return _along(a, ac, d2 / (d2 - d6)), EDGE_CA
-    wa = _dot(n, _cross(_sub(c, b), bp))
-    if wa <= 0.0 and d4 >= d3 and d5 >= d6:
-        return _along(b, _sub(c, b), (d4 - d3) / ((d4 - d3) + (d5 - d6))), EDGE_BC
-    total = wa + wb + wc
-    if total <= 0.0:  # a face without area
-        edges = ((a, ab, EDGE_AB), (b, _sub(c, b), EDGE_BC), (c, _sub(a, c), EDGE_CA))
-        near = [(_along(u, d, _on_segment(p, u, d)), feature) for u, d, feature in edges]
-        return min(near, key=lambda pair: math.dist(p, pair[0]))
-    return _along(_along(a, ab, wb / total), ac, wc / total), FACE
-
-
-def _on_segment(p: Triple, a: Triple, d: Triple) -> float:
-    """Fraction of the segment from a to a + d that is closest to p."""
-    square = _dot(d, d)
-    return min(max(_dot(_sub(p, a), d) / square, 0.0), 1.0) if square > 0.0 else 0.0
-
-
-def _segments(a: Triple, d: Triple, b: Triple, e: Triple) -> tuple[float, float]:
-    """Fractions of the segments a, a + d and b, b + e that are closest to each other (Ericson 2005,
-    5.1.9)."""
-    dd, de, ee, r = _dot(d, d), _dot(d, e), _dot(e, e), _sub(a, b)
-    det = dd * ee - de * de
-    s = min(max((de * _dot(e, r) - ee * _dot(d, r)) / det, 0.0), 1.0) if det > 0.0 else 0.0
-    t = _on_segment(_along(a, d, s), b, e)
-    return _on_segment(_along(b, e, t), a, d), t
-
-
-def _segment_triangle(p: Triple, q: Triple, a: Triple, b: Triple, c: Triple) -> tuple[float, Triple]:
-    """Fraction of the segment p-q and point of the triangle closest to each other; where it crosses, the
-    crossing."""
-    d = _sub(q, p)
-    n = _cross(_sub(b, a), _sub(c, a))
-    hp, hq = _dot(n, _sub(p, a)), _dot(n, _sub(q, a))
-    if hp * hq <= 0.0 and hp != hq:
-        t = hp / (hp - hq)
-        x = _along(p, d, t)
-        sides = (_dot(n, _cross(_sub(v, u), _sub(x, u))) for u, v in ((a, b), (b, c), (c, a)))
-        if all(side >= 0.0 for side in sides):
-            return t, x
-    near = [(0.0, _on_triangle(p, a, b, c)[0]), (1.0, _on_triangle(q, a, b, c)[0])]
-    for u, v in ((a, b), (b, c), (c, a)):
-        near.append((_on_segment(u, p, d), u))
-        s, t = _segments(p, d, u, _sub(v, u))
-        near.append((s, _along(u, _sub(v, u), t)))
-    return min(near, key=lambda pair: math.dist(_along(p, d, pair[0]), pair[1]))
-
-
-def _sphere(p: Triple, size: Triple) -> Signed:
-    r = math.hypot(*p)
-    return r - size[0], ((p[0] / r, p[1] / r, p[2] / r) if r > 0.0 else (0.0, 0.0, 1.0))
-
-
-def _capsule(p: Triple, size: Triple) -> Signed:
-    half = 0.5 * size[1]
-    v = (p[0], p[1], p[2] - min(max(p[2], -half), half))
-    r = math.hypot(*v)
-    return r - size[0], ((v[0] / r, v[1] / r, v[2] / r) if r > 0.0 else (1.0, 0.0, 0.0))
-
-
-def _corner(depth: tuple[float, ...], outward: tuple[Triple, ...]) -> Signed:
-    """Signed distance to a convex corner of walls at right angles, from that to each wall and the wall's
-    outward normal."""
-    out = [max(v, 0.0) for v in depth]
-    r = math.hypot(*out)
-    if r <= 0.0:
-        k = max(range(len(depth)), key=lambda i: depth[i])
-        return depth[k], outward[k]
-    x, y, z = (sum(v * n[i] for v, n in zip(out, outward, strict=True)) / r for i in range(3))
-    return r, (x, y, z)
-
-
-def _box(p: Triple, size: Triple) -> Signed:
-    x, y, z = (math.copysign(1.0, v) for v in p)
-    depth = tuple(abs(v) - 0.5 * edge for v, edge in zip(p, size, strict=True))
-    return _corner(depth, ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z)))
-
-
-def _cylinder(p: Triple, size: Triple) -> Signed:
-    r = math.hypot(p[0], p[1])
-    side = (p[0] / r, p[1] / r, 0.0) if r > 0.0 else (1.0, 0.0, 0.0)
-    return _corner((r - size[0], abs(p[2]) - 0.5 * size[1]), (side, (0.0, 0.0, math.copysign(1.0, p[2]))))
-
-
-def _plane(p: Triple, size: Triple) -> Signed:  # noqa: ARG001
-    return p[2], (0.0, 0.0, 1.0)
-
-
-_SIGNED: dict[str, Callable[[Triple, Triple], Signed]] = {
-    "sphere": _sphere,
-    "capsule": _capsule,
-    "box": _box,
-    "cylinder": _cylinder,
-    "plane": _plane,
-}
-
-
 def _lowest(obstacle: Obstacle, p: Floats, q: Floats) -> float:
     """Fraction of the segment p-q, obstacle frame, where the signed distance to a primitive is least; it is
     convex along it."""
-    a, d = _triple(p), _triple(q - p)
-    if obstacle.shape == "plane":
-        return 1.0 if d[2] < 0.0 else 0.0
-    if obstacle.shape == "sphere":
-        return _on_segment((0.0, 0.0, 0.0), a, d)
-    if obstacle.shape == "capsule":
-        axis = (0.0, 0.0, obstacle.size[1])
-        crossing = _segments(a, d, (0.0, 0.0, -0.5 * obstacle.size[1]), axis)[0]
-        near = [
-            crossing,
-            0.0,
-            1.0,
-            *(_on_segment((0.0, 0.0, z * obstacle.size[1]), a, d) for z in (-0.5, 0.5)),
-        ]
-        return min(near, key=lambda t: _capsule(_along(a, d, t), obstacle.size)[0])
-    signed, size = _SIGNED[obstacle.shape], obstacle.size
-
-    def at(t: float) -> float:
-        return signed(_along(a, d, t), size)[0]
-
-    low, high = 0.0, 1.0
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    f_left, f_right = at(left), at(right)
-    while high - low > 1e-12:
-        if f_left <= f_right:
-            high, right, f_right = right, left, f_left
-            left = high - _GOLDEN * (high - low)
-            f_left = at(left)
-        else:
-            low, left, f_left = left, right, f_right
-            right = low + _GOLDEN * (high - low)
-            f_right = at(right)
-    return min((0.0, 1.0, 0.5 * (low + high)), key=at)
+    primitive, a, d = primitive_of(obstacle.shape), _triple(p), _triple(q - p)
+    if primitive.lowest is not None:
+        return primitive.lowest(obstacle.size, a, d)
+    return lowest(lambda t: primitive.plain(obstacle.size, along(a, d, t))[0])

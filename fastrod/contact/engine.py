@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fastrod.contact.contacts import Contacts, contacts_of
 from fastrod.contact.frames import back_by, between, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.tree import pack
+from fastrod.contact.tree import addresses, pack
 from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
 from fastrod.kernels.batch import arrange, search_parallel, search_serial, search_worlds
@@ -79,6 +79,11 @@ class Engine:
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take up what `pickle` or `copy` made: compiled shapes stand elsewhere in another process."""
+        self.__dict__.update(state)
+        self.surfaces = self.surfaces._replace(primitive=addresses(self.scene.obstacles))
 
     def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
         """`poses` (1 or n_robots, n_obstacles, 7) of the obstacles in this step, world. Those with a

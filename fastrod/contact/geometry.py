@@ -1,6 +1,6 @@
-"""What a rod can touch: `Obstacle`, and the functions that make one; checked once.
+"""What a rod can touch: `Obstacle`, checked once, and `mesh` and `obstacle`, which make one.
 
->>> ball = sphere(0.02, position=(0.0, 0.0, 0.1), friction=0.3)
+>>> ball = obstacle("sphere", (0.02,), position=(0.0, 0.0, 0.1), friction=0.3)
 >>> ball.name, ball.shape, ball.size
 ('sphere', 'sphere', (0.02, 0.0, 0.0))
 """
@@ -13,24 +13,23 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from fastrod.contact.closest import Triple
 from fastrod.contact.meshfile import FORMATS, MeshLimits, read_mesh
+from fastrod.contact.primitive import primitive_of
 from fastrod.errors import InputError, nearest
 from fastrod.types import Floats, Ints
 
 if TYPE_CHECKING:
     import trimesh
 
-ObstacleShape: TypeAlias = Literal["mesh", "sphere", "box", "cylinder", "capsule", "plane"]
-Triple: TypeAlias = tuple[float, float, float]
 Quadruple: TypeAlias = tuple[float, float, float, float]
 
-_SIZES = {"mesh": 0, "sphere": 1, "box": 3, "cylinder": 2, "capsule": 2, "plane": 0}
 _LARGEST = 10.0  # m; a larger obstacle was given in mm
 _FARTHEST = 1e6  # m; of any vertex, used or not: beyond it squares and products leave what a float can hold
 _SMALLEST = 1e-4  # m; a smaller one was scaled twice
@@ -40,7 +39,8 @@ _MOST_SLIVERS = 100_000  # a mesh of more was not made to be a solid, and joinin
 _USUAL_FRICTION, _LARGEST_FRICTION = 5.0, 10.0
 
 
-def _numbers(where: str, values: object, count: int, unit: str) -> tuple[float, ...]:
+def finite_numbers(where: str, values: object, count: int, unit: str) -> tuple[float, ...]:
+    """`values` as floats. Raises `InputError` where they are not `count` finite numbers [`unit`]."""
     try:
         numbers = tuple(float(v) for v in values)  # type: ignore[attr-defined]
     except (TypeError, ValueError):
@@ -73,17 +73,17 @@ def _check_extent(where: str, extent: float, remedy: str) -> None:
 class Obstacle:
     """A rigid or springy body that rods can touch, in its own frame, and where it stands at rest.
 
-    Make one with `mesh`, `box`, `sphere`, `cylinder`, `capsule` or `plane`. Two obstacles are equal only
-    where they are the same object. Raises `InputError` where a number is out of range.
+    Make one with `mesh`, with `sphere`, `box` and the like, or by the name of its shape with `obstacle`. Two
+    obstacles are equal only where they are the same object. Raises `InputError` where a number is out of
+    range.
     """
 
     name: str
-    shape: ObstacleShape
+    shape: str
+    """ "mesh", or the name of a `Primitive`."""
     size: Triple
-    """Sphere (radius, 0, 0); box: full edge lengths; cylinder (radius, length, 0) and capsule (radius, length
-    of the straight part,
-    0), both centred, axis z; mesh and plane (0, 0, 0) [m]. A plane is the solid half-space z <= 0 of its own
-    frame."""
+    """Lengths of the shape, as its own function says, and 0 for those that it does not have; all 0 of a mesh
+    [m]."""
     vertices: Floats
     """(n_vertices, 3) obstacle frame [m]; (0, 3) for anything but a mesh."""
     faces: Ints
@@ -102,29 +102,21 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         where = f"{self.shape} {self.name!r}"
-        if self.shape not in get_args(ObstacleShape):
-            raise InputError(
-                f"Obstacle.shape is {self.shape!r}; {nearest(str(self.shape), get_args(ObstacleShape))}"
-            )
-        size = _numbers(f"size of {where}", self.size, 3, "m")
-        used = _SIZES[self.shape]
+        primitive = None if self.shape == "mesh" else primitive_of(self.shape)
+        size: Any = finite_numbers(f"size of {where}", self.size, 3, "m")
+        used = 0 if primitive is None else primitive.n_sizes
         if any(v <= 0.0 for v in size[:used]) or any(size[used:]):
             need = f"{used} positive and {3 - used} zero" if used < 3 else "3 positive"
             raise InputError(f"size of {where} is {list(size)!r} m; a {self.shape} needs {need} numbers.")
-        if used:
-            extent = {
-                "sphere": 2.0 * size[0],
-                "cylinder": max(2.0 * size[0], size[1]),
-                "capsule": 2.0 * size[0] + size[1],
-            }
-            _check_extent(where, extent.get(self.shape, max(size)), "a factor")
+        if primitive is not None and used:
+            _check_extent(where, primitive.width(size), "a factor")
         vertices, faces = _arrays(where, self.vertices, self.faces)
         if (self.shape == "mesh") != (len(faces) > 0):
             raise InputError(
                 f"{where} has {len(faces)} faces; a mesh needs some, and any other shape has none."
             )
-        position = _numbers(f"position of {where}", self.position, 3, "m")
-        quaternion = _numbers(f"quaternion of {where}", self.quaternion, 4, "w x y z")
+        position = finite_numbers(f"position of {where}", self.position, 3, "m")
+        quaternion = finite_numbers(f"quaternion of {where}", self.quaternion, 4, "w x y z")
         if abs(math.hypot(*quaternion) - 1.0) > 1e-6:
             raise InputError(
                 f"quaternion of {where} is {list(quaternion)!r} with norm "
@@ -157,18 +149,8 @@ class Obstacle:
         """A new trimesh.Trimesh in the obstacle frame [m], for drawing; a plane is a square of 1 m. Needs
         trimesh."""
         lib = _trimesh()
-        a, b, c = self.size
-        if self.shape == "sphere":
-            made = lib.creation.icosphere(subdivisions=3, radius=a)
-        elif self.shape == "box":
-            made = lib.creation.box(extents=(a, b, c))
-        elif self.shape == "cylinder":
-            made = lib.creation.cylinder(radius=a, height=b)
-        elif self.shape == "capsule":
-            made = lib.creation.capsule(radius=a, height=b)
-        elif self.shape == "plane":
-            corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
-            made = lib.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False)
+        if self.shape != "mesh":
+            made = primitive_of(self.shape).drawing(lib, self.size)
         else:
             made = lib.Trimesh(vertices=self.vertices.copy(), faces=self.faces.copy(), process=False)
         return made  # type: ignore[no-any-return]
@@ -184,7 +166,10 @@ class Placement(TypedDict, total=False):
     stiffness: float
 
 
-def _primitive(shape: ObstacleShape, size: Sequence[float], given: Placement) -> Obstacle:
+def obstacle(shape: str, size: Sequence[float] = (), **given: Unpack[Placement]) -> Obstacle:
+    """A simple shape by its name (`Primitive.name`), with the lengths that it has [m]; `Obstacle` says what
+    the options are, and what raises `InputError`."""
+    n_sizes = primitive_of(shape).n_sizes
     options: dict[str, Any] = {
         "position": (0.0, 0.0, 0.0),
         "quaternion": (1.0, 0.0, 0.0, 0.0),
@@ -197,64 +182,10 @@ def _primitive(shape: ObstacleShape, size: Sequence[float], given: Placement) ->
             raise InputError(f"a {shape} has no option {option!r}; {nearest(option, known)}")
         options[option] = value
     options["name"] = options.get("name") or shape
-    full = _numbers(f"size of {shape} {options['name']!r}", size, _SIZES[shape], "m") + (0.0,) * (
-        3 - _SIZES[shape]
-    )
+    full = finite_numbers(f"size of {shape} {options['name']!r}", size, n_sizes, "m") + (0.0,) * (3 - n_sizes)
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     fields: dict[str, Any] = {"size": full, "vertices": none, "faces": nothing, "closed": True}
     return Obstacle(shape=shape, **fields, **options)
-
-
-def sphere(radius: float, **options: Unpack[Placement]) -> Obstacle:
-    """A ball of `radius` [m]; `Obstacle` says what the options are, and what raises `InputError`."""
-    return _primitive("sphere", (radius,), options)
-
-
-def box(size: Sequence[float], **options: Unpack[Placement]) -> Obstacle:
-    """A cuboid with full edge lengths `size` [m], centred; `Obstacle` says what the options are, and what
-    raises `InputError`."""
-    return _primitive("box", size, options)
-
-
-def cylinder(radius: float, length: float, **options: Unpack[Placement]) -> Obstacle:
-    """A solid cylinder with flat caps [m], centred, axis z; `Obstacle` says what the options are, and what
-    raises `InputError`."""
-    return _primitive("cylinder", (radius, length), options)
-
-
-def capsule(radius: float, length: float, **options: Unpack[Placement]) -> Obstacle:
-    """A cylinder of `length` with round ends [m], centred, axis z; `Obstacle` says what the options are, and
-    what raises `InputError`."""
-    return _primitive("capsule", (radius, length), options)
-
-
-def plane(
-    point: Sequence[float] = (0.0, 0.0, 0.0),
-    normal: Sequence[float] = (0.0, 0.0, 1.0),
-    *,
-    name: str | None = None,
-    friction: float = 0.0,
-    stiffness: float = math.inf,
-) -> Obstacle:
-    """The half-space behind `point` [m]: solid opposite to `normal` (any length), both world frame at rest;
-    see `Obstacle`.
-
-    >>> plane(normal=(0.0, 0.0, -2.0)).quaternion
-    (0.0, 1.0, 0.0, 0.0)
-    """
-    n = _numbers("plane normal", normal, 3, "1")
-    length = math.hypot(*n)
-    if length < 1e-12:
-        raise InputError(f"plane normal is {list(n)!r}; it must have a direction, for example (0, 0, 1).")
-    x, y, z = (v / length for v in n)
-    w = math.sqrt(max(0.0, (1.0 + z) / 2.0))
-    facing = (w, -y / (2.0 * w), x / (2.0 * w), 0.0) if w > 1e-6 else (0.0, 1.0, 0.0, 0.0)
-    at = _numbers("plane point", point, 3, "m")
-    return _primitive(
-        "plane",
-        (),
-        {"name": name, "position": at, "quaternion": facing, "friction": friction, "stiffness": stiffness},
-    )
 
 
 def mesh(

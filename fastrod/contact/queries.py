@@ -44,7 +44,7 @@ def _gap(
     n, n_points = shape.arclength.shape
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
     surfaces = surfaces._replace(
-        kind=surfaces.kind[which],
+        primitive=surfaces.primitive[which],
         size=surfaces.size[which],
         sphere=surfaces.sphere[which],
         friction=surfaces.friction[which],
@@ -68,7 +68,7 @@ def _gap(
     )
     finite = np.isfinite(shape.position).all((1, 2))
     some = np.flatnonzero(finite if rows is None else finite & rows)
-    if len(surfaces.kind):
+    if len(surfaces.primitive):
         found, n_found = np.empty((len(some), MOST_FOUND), CANDIDATE), np.zeros(len(some), np.int64)
         search_serial(some, engine.rods, surfaces, motion, found, n_found, search_work(1, n_points))
     if only is None and engine.rods_meet:

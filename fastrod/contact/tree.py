@@ -3,7 +3,6 @@ numbers."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -11,11 +10,10 @@ import numpy as np
 
 from fastrod.contact.geometry import Obstacle
 from fastrod.contact.normals import pseudonormals
+from fastrod.contact.primitive import primitive_of
 from fastrod.kernels.contact.bvh import LEAF_CODE
-from fastrod.kernels.contact.primitive import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE
 from fastrod.types import Floats, Ints, Surfaces
 
-_KIND = {"mesh": MESH, "sphere": SPHERE, "box": BOX, "cylinder": CYLINDER, "capsule": CAPSULE, "plane": PLANE}
 _LEAF = 4  # triangles at most
 
 
@@ -42,7 +40,7 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
         normals.append(normal)
         n_nodes, n_faces = n_nodes + len(box), n_faces + len(corner)
     return Surfaces(
-        kind=np.array([_KIND[o.shape] for o in obstacles], np.int64),
+        primitive=addresses(obstacles),
         size=np.array([o.size for o in obstacles], float).reshape(-1, 3),
         sphere=np.array([_ball(o) for o in obstacles], float).reshape(-1, 4),
         friction=np.array([o.friction for o in obstacles], float),
@@ -57,20 +55,24 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
     )
 
 
+def addresses(obstacles: Sequence[Obstacle]) -> Ints:
+    """(n_obstacles, 2) `Surfaces.primitive` in this process. Raises `InputError` where a shape is none."""
+    found = np.zeros((len(obstacles), 2), np.int64)
+    for row, o in zip(found, obstacles, strict=True):
+        if o.shape != "mesh":
+            primitive = primitive_of(o.shape)
+            primitive.check(o.size)
+            row[:] = primitive.addresses
+    return found
+
+
 def _ball(o: Obstacle) -> tuple[float, float, float, float]:
     """Centre and radius of a ball that holds the obstacle."""
     if o.shape == "mesh":
         low, high = o.vertices.min(0), o.vertices.max(0)
         centre = 0.5 * (low + high)
         return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))
-    a, b, c = o.size
-    radius = {
-        "sphere": a,
-        "box": 0.5 * math.hypot(a, b, c),
-        "cylinder": math.hypot(a, 0.5 * b),
-        "capsule": a + 0.5 * b,
-    }
-    return 0.0, 0.0, 0.0, radius.get(o.shape, math.inf)
+    return 0.0, 0.0, 0.0, primitive_of(o.shape).radius(o.size)
 
 
 @lru_cache(maxsize=64)

@@ -2,25 +2,30 @@
 
 numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale
 results. The cache directory is therefore named after a hash of every kernel source, of the arrays' names and
-of numba's version.
+of numba's version; that of a function which is called by its address (`pointed`) also after its own file.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from .notice import announce
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _config: Any = numba.config
 _njit: Any = numba.njit  # its type does not know _nrt
+_intrinsic: Any = intrinsic  # untyped
 
 LANES = 16
 """Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
@@ -91,13 +96,65 @@ def inline(function: _Function) -> _Function:
     return cast(_Function, _njit(forceinline=True, error_model="numpy", fastmath=_FAST, _nrt=False)(function))
 
 
-def _compile(function: _Function, **options: bool) -> _Function:
+def _compile(function: _Function, folder: str | None = CACHE_DIR, **options: bool) -> _Function:
     before = _config.CACHE_DIR
-    _config.CACHE_DIR = CACHE_DIR or before
+    _config.CACHE_DIR = folder or before
     try:
-        made = _njit(cache=CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(
+        made = _njit(cache=folder is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(
             function
         )
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)
+
+
+def pointed(function: _Function, signature: Any) -> tuple[_Function, int]:
+    """`function` compiled by itself for one signature, and its address in this process for a `caller`: the
+    kernels that call it need not be compiled again. Without the compiler a number that stands for it."""
+    function = getattr(function, "py_func", function)
+    if _config.DISABLE_JIT:
+        _POINTED.append(function)
+        return function, len(_POINTED)
+    compiled: Any = _compile(function, folder=_own_folder(function))
+    result = compiled.get_compile_result(signature)
+    _POINTED.append(compiled)
+    return compiled, result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
+
+
+_POINTED: list[Any] = []
+"""Compiled code stays where it is as long as somebody holds it."""
+
+
+def _own_folder(function: Callable[..., Any]) -> str | None:
+    """Where the code of this function is kept: a folder for each state of the file that it stands in."""
+    file = getattr(sys.modules.get(function.__module__), "__file__", None)
+    if CACHE_DIR is None or file is None:  # of a notebook
+        return None
+    source = Path(file)
+    try:
+        folder = Path(CACHE_DIR) / f"{source.stem}-{hashlib.sha256(source.read_bytes()).hexdigest()[:16]}"
+        folder.mkdir(exist_ok=True)
+    except OSError:
+        return None
+    return str(folder)
+
+
+def caller(signature: Any) -> Any:
+    """A function for kernels, (address, a, b) -> what the function of this signature that is `pointed` there
+    returns for a and b."""
+    if _config.DISABLE_JIT:
+        return lambda address, a, b: _POINTED[address - 1](a, b)
+
+    def call(_: Any, address: Any, a: Any, b: Any) -> Any:  # noqa: ARG001
+        return signature.return_type(types.intp, *signature.args), generate
+
+    def generate(context: Any, builder: Any, made: Any, given: Any) -> Any:
+        kind = context.call_conv.get_function_type(made.return_type, made.args[1:]).as_pointer()
+        status, result = context.call_conv.call_function(
+            builder, builder.inttoptr(given[0], kind), made.return_type, made.args[1:], given[1:]
+        )
+        with cgutils.if_unlikely(builder, status.is_error):
+            context.call_conv.return_status_propagate(builder, status)
+        return result
+
+    return _intrinsic(call)

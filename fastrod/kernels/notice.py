@@ -10,6 +10,7 @@ from typing import Any
 from numba.core import event
 
 _register: Any = event.register  # it has no types
+_LONG = ("fastrod.kernels.", "fastrod.solver.")  # a shape of contact is compiled in a second
 _CONTACT = ("iterate_serial", "iterate_parallel", "search_serial", "search_parallel")
 
 
@@ -24,7 +25,7 @@ class _Notice(event.Listener):
     def on_start(self, what: Any) -> None:
         """Print, unless `FASTROD_QUIET` is set or this line was printed before."""
         function = what.data["dispatcher"].py_func
-        if os.environ.get("FASTROD_QUIET") or not function.__module__.startswith("fastrod."):
+        if os.environ.get("FASTROD_QUIET") or not function.__module__.startswith(_LONG):
             return
         contact = function.__name__ in _CONTACT
         work = "Compiling contact kernels, about two minutes" if contact else "Compiling kernels, about 30 s"

@@ -6,6 +6,7 @@ A rotation or matrix is its nine entries row by row; a symmetric matrix its xx, 
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 from .jit import inline
@@ -43,6 +44,13 @@ def axpy(k: float, a: Vec, b: Vec) -> Vec:
 def dot(a: Vec, b: Vec) -> float:
     """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inline
+def unit(a: Vec, otherwise: Vec) -> tuple[float, Vec]:
+    """|a| and a / |a|, or `otherwise` where a has no direction."""
+    length = math.sqrt(dot(a, a))
+    return (length, scale(1.0 / length, a)) if length > 1e-15 else (0.0, otherwise)
 
 
 @inline

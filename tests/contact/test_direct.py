@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose
 
+from fastrod.contact import box, capsule, cylinder, ellipsoid, mesh, plane, sphere
 from fastrod.contact.direct import DirectScene
-from fastrod.contact.geometry import box, capsule, cylinder, mesh, plane, sphere
 from fastrod.errors import InputError
 from fastrod.rotation import matrix_from_quaternion
 
@@ -284,6 +284,8 @@ def surface(obstacle, n):
                 *(np.column_stack([a * v[:, None] * round_, np.full(u.shape, z)]) for z in (-b / 2, b / 2)),
             ]
         )
+    if obstacle.shape == "ellipsoid":
+        return np.column_stack([np.sin(math.pi * v)[:, None] * round_, np.cos(math.pi * v)]) * (a, b, c)
     ball = a * np.column_stack([np.sin(math.pi * v)[:, None] * round_, np.cos(math.pi * v)])
     if obstacle.shape == "sphere":
         return ball
@@ -297,6 +299,7 @@ PRIMITIVES = [
     cylinder(0.02, 0.05),
     cylinder(0.03, 0.01),
     capsule(0.015, 0.04),
+    ellipsoid((0.02, 0.012, 0.015)),
 ]
 
 
@@ -306,6 +309,8 @@ def holds(obstacle, p):
         return abs(x) < a / 2 and abs(y) < b / 2 and abs(z) < c / 2
     if obstacle.shape == "cylinder":
         return math.hypot(x, y) < a and abs(z) < b / 2
+    if obstacle.shape == "ellipsoid":
+        return math.hypot(x / a, y / b, z / c) < 1.0
     return math.dist(p, (0.0, 0.0, min(max(z, -b / 2), b / 2))) < a
 
 

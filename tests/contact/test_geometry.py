@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fastrod.contact.geometry import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.contact.normals import pseudonormals
 from fastrod.errors import InputError
 

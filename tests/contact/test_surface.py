@@ -10,9 +10,9 @@ import trimesh
 from numba import njit
 from numpy.testing import assert_allclose
 
+from fastrod.contact import Obstacle, box, capsule, cylinder, ellipsoid, mesh, plane, sphere
 from fastrod.contact.direct import DirectScene
 from fastrod.contact.frames import frames_of
-from fastrod.contact.geometry import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.contact.tree import pack
 from fastrod.kernels.contact.bvh import FAR, LEAF_CODE, STACK
 from fastrod.kernels.contact.surface import MOST_PLANES, ray_hit, signed_distance, surface_curvature, walls
@@ -34,6 +34,7 @@ PRIMITIVES = {
     "capsule": lambda: capsule(0.015, 0.04),
     "plane": lambda: plane(),
 }
+ELLIPSOIDS = {"egg": lambda: ellipsoid((0.02, 0.03, 0.045)), "lens": lambda: ellipsoid((0.03, 0.03, 0.01))}
 
 
 @njit()
@@ -281,14 +282,19 @@ def test_a_ray_meets_the_triangle_that_brute_force_finds(name):
 
 
 def exact_ray(obstacle, p, v):
-    """Where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane and a
-    box."""
+    """Where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane, an
+    ellipsoid and a box."""
     if obstacle.shape == "plane":
         t = np.array([-p[2] / v[2]])
     elif obstacle.shape == "sphere":
         b, c = p @ v, p @ p - obstacle.size[0] ** 2
         root = b * b - c
         t = np.array([]) if root < 0.0 else np.array([-b - math.sqrt(root), -b + math.sqrt(root)])
+    elif obstacle.shape == "ellipsoid":
+        q, w = p / obstacle.size, v / np.array(obstacle.size)
+        a, b, c = w @ w, q @ w, q @ q - 1.0
+        root = b * b - a * c
+        t = np.array([]) if root < 0.0 else np.array([-b - math.sqrt(root), -b + math.sqrt(root)]) / a
     else:
         a, b = (-np.array(obstacle.size) / 2 - p) / v, (np.array(obstacle.size) / 2 - p) / v
         low, high = np.minimum(a, b).max(), np.maximum(a, b).min()
@@ -309,10 +315,10 @@ def rays(seen, obstacle, rng, inside):
     return seen.ray(p, v, 1.0)[0], expected, steep
 
 
-@pytest.mark.parametrize("name", ["sphere", "plane", "box"])
+@pytest.mark.parametrize("name", ["sphere", "plane", "box", *ELLIPSOIDS])
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_ray_meets_a_primitive_where_the_closed_form_does(name, inside):
-    obstacle = PRIMITIVES[name]()
+    obstacle = (PRIMITIVES | ELLIPSOIDS)[name]()
     t, expected, steep = rays(Seen(obstacle), obstacle, np.random.default_rng(6), inside)
     plain = steep > 0.1
     assert np.isfinite(expected[plain]).sum() > 50
@@ -388,11 +394,11 @@ def difference(seen, points, h):
     return np.stack(columns, axis=2)
 
 
-@pytest.mark.parametrize("name", [*PRIMITIVES, "mesh"])
+@pytest.mark.parametrize("name", [*PRIMITIVES, *ELLIPSOIDS, "mesh"])
 def test_the_normal_turns_as_the_curvature_says(name):
     rng = np.random.default_rng(9)
     solid = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
-    seen = Seen(mesh(solid) if name == "mesh" else PRIMITIVES[name](), random_pose(rng))
+    seen = Seen(mesh(solid) if name == "mesh" else (PRIMITIVES | ELLIPSOIDS)[name](), random_pose(rng))
     points = (
         places(rng, solid, 200) if name == "mesh" else rng.uniform(-0.06, 0.06, (600, 3))
     ) @ seen.turn.T + seen.at

@@ -9,7 +9,7 @@ import trimesh
 from numpy.testing import assert_allclose
 
 from fastrod import Simulator, load_robot
-from fastrod.contact import ContactScene, Obstacle, box, capsule, cylinder, mesh, sphere
+from fastrod.contact import ContactScene, Obstacle, box, capsule, cylinder, ellipsoid, mesh, sphere
 
 # without the compiler numpy warns where a ray or a flat triangle divides by zero, and the infinity is what is
 # wanted
@@ -22,6 +22,7 @@ THINGS: dict[str, Obstacle] = {
     "capsule": capsule(0.01, 0.2, name="thing", position=(0.018, 0.0, 0.05), quaternion=ACROSS),
     "sphere": sphere(0.01, name="thing", position=(0.018, 0.0, 0.05)),
     "box": box((0.02, 0.1, 0.02), name="thing", position=(0.018, 0.0, 0.05), friction=0.2),
+    "ellipsoid": ellipsoid((0.01, 0.02, 0.015), name="thing", position=(0.018, 0.0, 0.05), friction=0.2),
     "mesh": mesh(
         trimesh.creation.icosphere(subdivisions=1, radius=0.01), name="thing", position=(0.018, 0.0, 0.05)
     ),

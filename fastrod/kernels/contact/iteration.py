@@ -154,7 +154,7 @@ def _indent(r: int, world: ContactWorld, proposed: Floats) -> float:
     deepest, i, surfaces = 0.0, world.robot[r], world.surfaces
     for q in range(world.contacts.used[i]):
         k = world.contacts.contact[i, q].obstacle
-        own = k < len(surfaces.kind)
+        own = k < len(surfaces.primitive)
         soft = surfaces.compliance[k] + surfaces.mobility[k, 0] if own else world.rods.compliance
         for a in range(3):
             deepest = max(deepest, soft * abs(proposed[q, a] - world.loads.force[r, q, a]))

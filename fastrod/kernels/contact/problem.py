@@ -119,7 +119,9 @@ def thread_problem(problem: ContactProblem, i: int) -> ContactProblem:
 @inline
 def rod_search(world: ContactWorld) -> RodSearch:
     """What the search between rods needs of a world."""
-    return RodSearch(world.motion, world.rods, world.contacts, len(world.surfaces.kind), world.motion.margin)
+    return RodSearch(
+        world.motion, world.rods, world.contacts, len(world.surfaces.primitive), world.motion.margin
+    )
 
 
 @inline

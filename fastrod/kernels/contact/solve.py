@@ -20,7 +20,7 @@ from .rod_proximity import partner_of
 def _measure_all(world: ContactWorld, stack: Numbers, problem: ContactProblem) -> int:
     """Write every contact of the world into the problem, with its geometric stiffness; returns how many there
     are."""
-    n_obstacles, m = len(world.surfaces.kind), 0
+    n_obstacles, m = len(world.surfaces.primitive), 0
     for r in range(world.first, world.last):
         i = world.robot[r]
         for q in range(world.contacts.used[i]):
