@@ -153,7 +153,7 @@ def caller(signature: Any) -> Any:
         status, result = context.call_conv.call_function(
             builder, builder.inttoptr(given[0], kind), made.return_type, made.args[1:], given[1:]
         )
-        with cgutils.if_unlikely(builder, status.is_error):
+        with cgutils.if_unlikely(builder, status.is_error):  # type: ignore[no-untyped-call]
             context.call_conv.return_status_propagate(builder, status)
         return result
 

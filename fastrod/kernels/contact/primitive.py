@@ -13,10 +13,10 @@ from ..jit import caller, kernel
 from ..vec import Vec, axpy, dot
 from .bvh import FAR
 
-_VEC = types.UniTuple(types.float64, 3)
-DISTANCE = types.Tuple((types.float64, _VEC))(_VEC, _VEC)
+_VEC = types.UniTuple(types.float64, 3)  # type: ignore[no-untyped-call]
+DISTANCE = types.Tuple((types.float64, _VEC))(_VEC, _VEC)  # type: ignore[no-untyped-call]
 """(size, p) -> signed distance of p and its gradient, the outward unit normal."""
-CURVATURE = types.Tuple((types.float64, types.float64, _VEC))(_VEC, _VEC)
+CURVATURE = types.Tuple((types.float64, types.float64, _VEC))(_VEC, _VEC)  # type: ignore[no-untyped-call]
 """(size, p) -> what `surface_curvature` returns of p, in the frame of the shape."""
 
 signed_at = caller(DISTANCE)
