@@ -9,6 +9,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
+from fastrod.control import scaled_rates
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
@@ -22,7 +23,6 @@ from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, Drive, PushOptions
-from fastrod_envs.rodtask import resolved
 from fastrod_envs.shapes import box_mesh
 from fastrod_envs.task import Backdrop, Ball, Field, Solid, Tube
 
@@ -172,7 +172,7 @@ class PushCell(Cell):
             [*(ahead * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
         )
         jacobian = drive.jacobian(self.simulator) * drive.rate
-        rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
+        rates = scaled_rates(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
         if self.options.action == "rate":
             return np.asarray(rates)
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)

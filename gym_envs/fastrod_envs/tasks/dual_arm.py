@@ -7,6 +7,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
+from fastrod.control import scaled_rates
 from fastrod.errors import HostError
 from fastrod.hosts import Bullet, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
@@ -17,7 +18,6 @@ from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, short, solid_box
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.rodtask import resolved
 from fastrod_envs.task import Backdrop, Ball, Field, Tube
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
@@ -223,7 +223,7 @@ class _Pair(Cell):
                     to = 0.5 * (self.low[k] + self.high[k]) + 0.5 * (self.high[k] - self.low[k]) * moves[k]
                     velocity = np.clip((to - soft.tip) / substep, -SPEED, SPEED)
                 jacobian = soft.jacobian()[:3] * soft.rate
-                rates = resolved(jacobian[None], velocity[None], -soft.posture()[None])[0]
+                rates = scaled_rates(jacobian[None], velocity[None], -soft.posture()[None])[0]
                 soft.drive(soft.action + substep * soft.rate * rates)
             self._advance(substep)
             self._look()

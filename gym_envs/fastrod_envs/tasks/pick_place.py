@@ -9,6 +9,7 @@ from typing import ClassVar, Literal, final, get_args
 
 import numpy as np
 
+from fastrod.control import ResolvedRate
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
@@ -193,6 +194,14 @@ class _Table(Cell):
             bend_rate=BEND_RATE,
             extension_rate=0.01,
         )
+        self._joints = ResolvedRate(
+            gain=1.0 / self.soft.dt,
+            damping=1e-3,
+            threshold=math.inf,
+            lower=self.arm.lower,
+            upper=self.arm.upper,
+            rate=self.arm.velocity_limit,
+        )
         self.bodies = RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*_BODY, 1.0))
         self.shown_cube, self.shown_spot, self.shown_gripper = _furnish(self.shown, self.width)
 
@@ -370,10 +379,8 @@ class _Table(Cell):
         error = np.concatenate(
             [self.flange[:3] - now[:3], rotation_between(now[None, 3:], self.flange[None, 3:])[0]]
         )
-        jacobian = self.arm.jacobian(self.q)
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(6), error)
-        most = self.arm.velocity_limit * self.soft.dt
-        self.q = np.clip(self.q + np.clip(step, -most, most), self.arm.lower, self.arm.upper)
+        rates = self._joints.rates(self.q, self.arm.jacobian(self.q), error, np.zeros(6), self.soft.dt)
+        self.q = self.q + self.soft.dt * rates
 
     def _base(self) -> Floats:
         """(7,) of the soft robot, on the flange."""
