@@ -23,8 +23,7 @@ from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, Drive, PushOptions
-from fastrod_envs.shapes import box_mesh
-from fastrod_envs.task import Backdrop, Ball, Field, Solid, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 
 ACCURACY = 0.02
 """Of the cube's place [m]."""
@@ -180,7 +179,6 @@ class PushCell(Cell):
     def backdrop(self) -> Backdrop:
         """Rod and bar as tubes, the cube, and its goal as a ball; seen from the course's right."""
         position, rotation = self._cube()
-        vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
         points = self.simulator.state.position[0]
         neck = Tube(points, self._own.robots[0].segments[0].body_radius or self.course.thickness, _ROD)
         bar = Tube(_bar_nodes(self.course, self.simulator.state)[0], self.course.thickness, _BAR)
@@ -188,7 +186,7 @@ class PushCell(Cell):
         eye, target = self._view()
         return Backdrop(
             tubes=(neck, bar),
-            solids=(Solid(vertices, faces, _CUBE),),
+            solids=(solid_box(position, [0.5 * self.course.size] * 3, _CUBE, rotation),),
             balls=(Ball(goal, 0.012, _GOAL),),
             eye=eye,
             target=target,

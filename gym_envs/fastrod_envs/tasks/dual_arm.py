@@ -15,10 +15,10 @@ from fastrod.hosts.gripper import Gripper
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_envs.arms import SoftArm, short, solid_box
+from fastrod_envs.arms import SoftArm, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.task import Backdrop, Ball, Field, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
 HEIGHT = 0.3

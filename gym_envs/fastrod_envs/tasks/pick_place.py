@@ -19,10 +19,10 @@ from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_envs.arms import SoftArm, arm_tube, short, solid_box
+from fastrod_envs.arms import SoftArm, arm_tube, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.task import Backdrop, Ball, Field, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.carried import RADIUS, Bracket, soft_robot
 from fastrod_scenes.ur5.picking import ADAPTER, SIDE, TOP, WIDTH
