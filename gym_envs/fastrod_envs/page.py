@@ -14,7 +14,7 @@ import numpy as np
 from fastrod.access import serve_guarded
 from fastrod.errors import InputError
 from fastrod.types import Floats
-from fastrod_envs.painter import ball_mesh, tube_mesh
+from fastrod_envs.painter import DrawnPiece, pieces
 from fastrod_envs.task import Backdrop, Task
 
 SHOWN = 16
@@ -93,50 +93,34 @@ class EnvPage:
     def _draw(self, at: str, backdrop: Backdrop) -> list[str]:
         """Everything of one environment; the names it has in the page."""
         names = []
-        for i, tube in enumerate(backdrop.tubes):
-            names.append(f"{at}/tube{i}")
-            self._mesh(names[-1], *tube_mesh(tube.points, tube.radius, 16), tube.color, 1.0, flat=False)
-        for i, ball in enumerate(backdrop.balls):
-            names.append(f"{at}/ball{i}")
-            mesh = ball_mesh()
-            self._mesh(
-                names[-1],
-                np.asarray(ball.position) + ball.radius * mesh.vertices,
-                mesh.faces,
-                ball.color,
-                1.0,
-                flat=False,
-            )
-        for i, solid in enumerate(backdrop.solids):
-            names.append(f"{at}/solid{i}")
-            self._mesh(names[-1], solid.vertices, solid.faces, solid.color, solid.opacity, flat=True)
+        for piece in pieces(backdrop, sides=16, n_points=2):
+            names.append(f"{at}/{piece.name}")
+            self._mesh(names[-1], piece)
         for i, line in enumerate(backdrop.lines):
             names.append(f"{at}/line{i}")
             points = np.asarray(line.points, float)
             self._line(names[-1], np.stack([points[:-1], points[1:]], axis=1), line.color)
         return names
 
-    def _mesh(
-        self, name: str, vertices: Floats, faces: Any, color: tuple[float, ...], opacity: float, *, flat: bool
-    ) -> None:
-        handle = self._known(name, vertices)
+    def _mesh(self, name: str, piece: DrawnPiece) -> None:
+        handle = self._known(name, piece.vertices)
         if handle is None:
             handle = self._server.scene.add_mesh_simple(
                 name,
-                np.asarray(vertices, np.float32),
-                np.asarray(faces, np.uint32),
-                color=_bytes(color),
-                opacity=None if opacity >= 1.0 else opacity,
-                flat_shading=flat,
+                piece.vertices.astype(np.float32),
+                piece.faces.astype(np.uint32),
+                color=_bytes(piece.color),
+                opacity=None if piece.opacity >= 1.0 else piece.opacity,
+                flat_shading=piece.flat,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-        elif np.abs(self._drawn[name][1] - vertices).max() > _STILL:
-            handle.vertices = np.asarray(vertices, np.float32)
+        elif np.abs(self._drawn[name][1] - piece.vertices).max() > _STILL:
+            handle.vertices = piece.vertices.astype(np.float32)
         else:
             return
-        self._drawn[name] = handle, np.array(vertices)
+        self._drawn[name] = handle, piece.vertices
 
     def _line(self, name: str, pairs: Floats, color: tuple[float, ...]) -> None:
         handle = self._known(name, pairs)

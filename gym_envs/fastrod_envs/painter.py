@@ -1,4 +1,5 @@
-"""A small painter: what a `Backdrop` looks like, in some milliseconds, without a window or a graphics card.
+"""What a `Backdrop` is drawn of (`pieces`), and a small painter: what it looks like, in some milliseconds,
+without a window or a graphics card.
 
 Everything becomes triangles. Of one layer the nearest triangle at every pixel is found, at twice the
 picture's resolution, and only then shaded. See-through solids are layers of their own, laid over what is
@@ -8,16 +9,16 @@ opaque.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.kernels import vec
 from fastrod.kernels.jit import entry, kernel
 from fastrod.types import Floats, Ints
-from fastrod_envs.task import Backdrop, Ball, DrawnLine, Solid, Tube
+from fastrod_envs.task import Backdrop, DrawnLine
 
 _FIELD_OF_VIEW = math.radians(36.0)  # from bottom to top
 _NEAR = 0.02  # m before the eye: nothing nearer is drawn
@@ -29,6 +30,8 @@ _SKY, _HORIZON, _FLOOR, _GRID = (
 )
 _MOUNT = (0.30, 0.33, 0.38)
 _SQUARE, _FOG = 0.1, 1.6  # m: of the grid; where the floor fades into the horizon
+_Vector: TypeAlias = tuple[float, float, float]
+_NONE: _Vector = (0.0, 0.0, 0.0)
 
 
 class PaintedMesh(NamedTuple):
@@ -38,6 +41,21 @@ class PaintedMesh(NamedTuple):
     """(n, 3) world [m]."""
     faces: Ints
     """(m, 3) counter-clockwise from outside."""
+
+
+class DrawnPiece(NamedTuple):
+    """A mesh with its looks."""
+
+    name: str
+    """The same from picture to picture."""
+    vertices: Floats
+    """(n, 3) world [m]."""
+    faces: Ints
+    """(m, 3)"""
+    color: tuple[float, float, float]
+    opacity: float = 1.0
+    flat: bool = False
+    """Its edges show."""
 
 
 class Layer(NamedTuple):
@@ -85,23 +103,33 @@ def paint(backdrop: Backdrop, width: int, height: int) -> np.ndarray:
     # a step at a time, so that it stays under what moves
     floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)
     camera = _camera(backdrop.eye, backdrop.target, width, height)
-    opaque = [
-        _lit(PaintedMesh(s.vertices, s.faces), s.color, True) for s in backdrop.solids if s.opacity >= 1.0
-    ]
-    opaque += [layer for tube in backdrop.tubes for layer in _tube_layers(tube)]
-    opaque += [_ball_layer(ball) for ball in backdrop.balls]
-    solid = _joined([layer for layer in opaque if len(layer.corners)])
+    drawn = list(pieces(backdrop))
+    solid = _joined([_lit(piece) for piece in drawn if piece.opacity >= 1.0])
     picture = (
         _ground(backdrop.eye, backdrop.target, width, height, floor)
         * _shadow(solid, camera, floor)[:, :, None]
     )
     ribbons = [_ribbon(line, camera) for line in backdrop.lines if len(line.points) > 1]
-    layers = [(_joined([solid, *ribbons]), 1.0)] + [
-        (_lit(PaintedMesh(s.vertices, s.faces), s.color, True), s.opacity)
-        for s in _far_to_near(backdrop, camera)
-    ]
+    clear = [piece for piece in drawn if piece.opacity < 1.0]
+    clear.sort(key=lambda piece: -float(np.linalg.norm(piece.vertices.mean(0) - camera.eye)))
+    layers = [(_joined([solid, *ribbons]), 1.0), *((_lit(piece), piece.opacity) for piece in clear)]
     _lay(picture, layers, camera)
     return np.asarray(np.clip(255.0 * picture + 0.5, 0.0, 255.0).astype(np.uint8))
+
+
+def pieces(backdrop: Backdrop, sides: int = _SIDES, n_points: int = 50) -> Iterator[DrawnPiece]:
+    """Everything but the lines: rods of at least `n_points`, the plates that they stand on, balls, solids."""
+    for i, tube in enumerate(backdrop.tubes):
+        points = _smooth(np.asarray(tube.points, float), n_points)
+        if len(points) > 1 and np.isfinite(points).all():
+            yield DrawnPiece(f"tube{i}", *tube_mesh(points, tube.radius, sides), tube.color)
+            yield DrawnPiece(f"plate{i}", *_plate(points, tube.radius), _MOUNT, flat=True)
+    for i, ball in enumerate(backdrop.balls):
+        mesh = ball_mesh()
+        at = np.asarray(ball.position) + ball.radius * mesh.vertices
+        yield DrawnPiece(f"ball{i}", at, mesh.faces, ball.color)
+    for i, solid in enumerate(backdrop.solids):
+        yield DrawnPiece(f"solid{i}", np.array(solid.vertices, float), *solid[1:], flat=True)
 
 
 def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> PaintedMesh:
@@ -213,42 +241,21 @@ def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
     return light
 
 
-def _tube_layers(tube: Tube) -> list[Layer]:
-    """The rod, and the plate that it stands on."""
-    points = _smooth(np.asarray(tube.points, float))
-    if len(points) < 2 or not np.isfinite(points).all():
-        return []
-    body = tube_mesh(points, tube.radius)
-    centre = np.concatenate([points, np.repeat(points[-1:], 5, axis=0)]).repeat(_SIDES, axis=0)
-    normals = (body.vertices - centre) / tube.radius
-    color = np.broadcast_to(np.array(tube.color, float), (len(body.faces), 3))
+def _plate(points: Floats, radius: float) -> PaintedMesh:
+    """What a rod along these points stands on."""
     along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    return [
-        Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))),
-        _plate(points[0], along, tube.radius),
-    ]
-
-
-def _plate(bottom: Floats, along: Floats, radius: float) -> Layer:
-    """What a rod of this radius stands on."""
-    ends = np.array([bottom - 0.7 * radius * along, bottom])
-    rim = tube_mesh(ends, 2.2 * radius, 2 * _SIDES).vertices[: 4 * _SIDES].reshape(2, 2 * _SIDES, 3)
-    outward = (rim[1] - bottom) / (2.2 * radius)
-    rings = np.concatenate(
-        [np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)]
+    ends, n = np.array([points[0] - 0.7 * radius * along, points[0]]), 2 * _SIDES
+    rim = tube_mesh(ends, 2.2 * radius, n).vertices[: 2 * n].reshape(2, n, 3)
+    middle = np.repeat(ends[:, None], n, axis=1)
+    rings = np.stack([middle[0], rim[0], *rim, rim[1], middle[1]])  # below, around, above: edges show
+    return PaintedMesh(
+        rings.reshape(-1, 3), np.concatenate([_grid_faces(2, n) + 2 * n * k for k in range(3)])
     )
-    faces = _grid_faces(4, 2 * _SIDES)
-    # lower side, rim, upper side
-    normals = np.broadcast_to(-along, (*faces.shape, 3)).reshape(3, -1, 3, 3).copy()
-    normals[1] = outward[faces.reshape(3, -1, 3)[1] % (2 * _SIDES)]
-    normals[2] = along
-    color = np.broadcast_to(np.array(_MOUNT), (len(faces), 3))
-    return Layer(rings.reshape(-1, 3)[faces], normals.reshape(-1, 3, 3), color, np.ones(len(faces)))
 
 
-def _smooth(points: Floats) -> Floats:
-    """A curve with points between points, where there are few (Catmull and Rom)."""
-    while 2 < len(points) < 50:
+def _smooth(points: Floats, n_points: int) -> Floats:
+    """A curve with points between points, where there are fewer (Catmull and Rom)."""
+    while 2 < len(points) < n_points:
         slope = np.gradient(points, axis=0)
         between = 0.5 * (points[:-1] + points[1:]) + 0.125 * (slope[:-1] - slope[1:])
         merged = np.empty((2 * len(points) - 1, 3))
@@ -257,27 +264,18 @@ def _smooth(points: Floats) -> Floats:
     return points
 
 
-def _ball_layer(ball: Ball) -> Layer:
-    mesh = ball_mesh()
-    corners = mesh.vertices[mesh.faces]
-    color = np.broadcast_to(np.array(ball.color, float), (len(corners), 3))
-    return Layer(np.asarray(ball.position) + ball.radius * corners, corners, color, np.ones(len(corners)))
-
-
-def _lit(mesh: PaintedMesh, color: tuple[float, ...], rounded: bool) -> Layer:
-    """Triangles under the light; `rounded`: smooth where neighbours are nearly in one plane, so that only
-    edges show."""
-    corners = np.asarray(mesh.vertices, float)[mesh.faces]
+def _lit(piece: DrawnPiece) -> Layer:
+    """Triangles under the light: smooth where neighbours are nearly in one plane, so that only edges show."""
+    faces = piece.faces
+    corners = piece.vertices[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-18)
-    normals = np.repeat(flat[:, None], 3, axis=1)
-    if rounded:
-        n, corner = len(mesh.vertices), mesh.faces.ravel()
-        mean = np.stack([np.bincount(corner, np.repeat(area[:, k], 3), n) for k in range(3)], axis=1)
-        mean = (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-18))[mesh.faces]
-        normals = np.where(((mean * normals).sum(2) > 0.9)[:, :, None], mean, normals)
+    normals, n = np.repeat(flat[:, None], 3, axis=1), len(piece.vertices)
+    mean = np.stack([np.bincount(faces.ravel(), np.repeat(area[:, k], 3), n) for k in range(3)], axis=1)
+    mean = (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-18))[faces]
+    normals = np.where(((mean * normals).sum(2) > 0.9)[:, :, None], mean, normals)
     return Layer(
-        corners, normals, np.broadcast_to(np.array(color, float), (len(corners), 3)), np.ones(len(corners))
+        corners, normals, np.tile(np.array(piece.color, float), (len(faces), 1)), np.ones(len(faces))
     )
 
 
@@ -293,21 +291,14 @@ def _ribbon(line: DrawnLine, camera: PainterCamera) -> Layer:
     faces = np.concatenate(
         [np.stack([i, i + 1, i + len(p)], 1), np.stack([i + 1, i + len(p) + 1, i + len(p)], 1)]
     )
-    layer = _lit(PaintedMesh(np.concatenate([p - side, p + side]), faces), line.color, False)
-    return layer._replace(shade=np.zeros(len(faces)))
+    color = np.tile(np.array(line.color, float), (len(faces), 1))
+    corners = np.concatenate([p - side, p + side])[faces]
+    return Layer(corners, np.zeros_like(corners), color, np.zeros(len(faces)))
 
 
 def _joined(layers: list[Layer]) -> Layer:
     empty = Layer(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
     return Layer(*(np.concatenate(arrays) for arrays in zip(empty, *layers, strict=True)))
-
-
-def _far_to_near(backdrop: Backdrop, camera: PainterCamera) -> list[Solid]:
-    """Solids that one sees through."""
-    clear = [solid for solid in backdrop.solids if solid.opacity < 1.0]
-    return sorted(
-        clear, key=lambda solid: -float(np.linalg.norm(np.asarray(solid.vertices).mean(0) - camera.eye))
-    )
 
 
 def _projected(corners: Floats, camera: PainterCamera) -> tuple[Floats, Floats]:
@@ -327,11 +318,11 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: PainterCame
     fine = camera._replace(width=_FINE * camera.width, height=_FINE * camera.height)
     color = picture.repeat(_FINE, axis=0).repeat(_FINE, axis=1)
     first = np.zeros((fine.height, fine.width), np.float32)
-    for layer, opacity in layers:
+    for k, (layer, opacity) in enumerate(layers):
         at, inverse = _projected(layer.corners, fine)
         depth, which = _nearest(at, inverse, fine)
         _shade((depth, which, first), (at, inverse), layer, fine, opacity, (color, picture))
-        first = first if first.any() else depth
+        first = depth if k == 0 else first
 
 
 def _nearest(at: Floats, inverse: Floats, camera: PainterCamera) -> tuple[NDArray[np.float32], Ints]:
@@ -344,7 +335,18 @@ def _nearest(at: Floats, inverse: Floats, camera: PainterCamera) -> tuple[NDArra
 
 
 @kernel
-def _weights(at: Floats, t: int, x: int, y: int) -> vec.Vec:
+def _dot(a: Floats | _Vector, b: Floats | _Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _plus(a: Floats | _Vector, k: float, b: Floats | _Vector) -> _Vector:
+    """a + k b."""
+    return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
+
+
+@kernel
+def _weights(at: Floats, t: int, x: int, y: int) -> _Vector:
     """Barycentric coordinates of a pixel's centre in triangle t."""
     x0, y0 = at[t, 0, 0], at[t, 0, 1]
     ex, ey, fx, fy = at[t, 1, 0] - x0, at[t, 1, 1] - y0, at[t, 2, 0] - x0, at[t, 2, 1] - y0
@@ -365,7 +367,7 @@ def _cover(at: Floats, inverse: Floats, depth: NDArray[np.float32], which: Ints)
             for i in range(left, right + 1):
                 w = _weights(at, t, i, j)
                 if min(w[0], w[1], w[2]) > -1e-9:
-                    near = np.float32(vec.dot(w, (inverse[t, 0], inverse[t, 1], inverse[t, 2])))
+                    near = np.float32(_dot(w, inverse[t]))
                     if near >= depth[j, i]:
                         depth[j, i], which[j, i] = near, t
 
@@ -381,7 +383,7 @@ def _shade(
 ) -> None:
     """Lay a layer's colour over a canvas, fine and coarse, where it is no farther than the first layer."""
     (depth, which, first), (at, inverse), (color, picture) = seen, projected, canvas
-    axes, light = camera.axes, (_LIGHT[0], _LIGHT[1], _LIGHT[2])
+    axes, light = camera.axes, _LIGHT
     focus = 0.5 * camera.height / math.tan(0.5 * _FIELD_OF_VIEW)
     for j in range(depth.shape[0]):
         for i in range(depth.shape[1]):
@@ -389,20 +391,19 @@ def _shade(
             if t < 0 or depth[j, i] < first[j, i]:
                 continue
             # a normal over its depth is linear in the picture, as one over depth is
-            w, n, view = _weights(at, t, i, j), (0.0, 0.0, 0.0), (-axes[2, 0], -axes[2, 1], -axes[2, 2])
+            w, n, view = _weights(at, t, i, j), _NONE, _plus(_NONE, -1.0, axes[2])
             for k in range(3):
-                corner = layer.normals[t, k]
-                n = vec.axpy(w[k] * inverse[t, k], (corner[0], corner[1], corner[2]), n)
+                n = _plus(n, w[k] * inverse[t, k], layer.normals[t, k])
             aside, down = (i + 0.5 - 0.5 * camera.width) / focus, (j + 0.5 - 0.5 * camera.height) / focus
-            view = vec.axpy(-aside, (axes[0, 0], axes[0, 1], axes[0, 2]), view)
-            view = vec.axpy(-down, (axes[1, 0], axes[1, 1], axes[1, 2]), view)
-            view = vec.scale(1.0 / math.sqrt(vec.dot(view, view)), view)
-            size = math.sqrt(max(vec.dot(n, n), 1e-18))
-            n = vec.scale(-1.0 / size if vec.dot(n, view) < 0.0 else 1.0 / size, n)
-            half = vec.add(view, light)
-            glance = max(vec.dot(n, half) / math.sqrt(vec.dot(half, half)), 0.0)
+            view = _plus(view, -aside, axes[0])
+            view = _plus(view, -down, axes[1])
+            view = _plus(_NONE, 1.0 / math.sqrt(_dot(view, view)), view)
+            size = math.sqrt(max(_dot(n, n), 1e-18))
+            n = _plus(_NONE, -1.0 / size if _dot(n, view) < 0.0 else 1.0 / size, n)
+            half = _plus(view, 1.0, light)
+            glance = max(_dot(n, half) / math.sqrt(_dot(half, half)), 0.0)
             shade = layer.shade[t]
-            bright = 1.0 + shade * (0.14 * n[2] + 0.46 * max(vec.dot(n, light), 0.0) - 0.48)
+            bright = 1.0 + shade * (0.14 * n[2] + 0.46 * max(_dot(n, light), 0.0) - 0.48)
             gleam = 0.28 * shade * glance**48
             for k in range(3):
                 change = opacity * (layer.color[t, k] * bright + gleam - color[j, i, k])
