@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import socket
 import sys
 from importlib.util import find_spec
 from typing import Any, final
 
 import numpy as np
 
-from fastrod.access import serve_guarded
+from fastrod.access import free_port, serve_guarded
 from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_envs.painter import DrawnPiece, pieces
@@ -19,7 +17,7 @@ from fastrod_envs.task import Backdrop, Task
 
 SHOWN = 16
 """Environments that are shown, at most."""
-_HOST, _PORT, _TRIES = "127.0.0.1", 8080, 20
+_HOST = "127.0.0.1"
 _STILL = 1e-7  # m: what has moved by less is not sent again
 _LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
 
@@ -33,7 +31,7 @@ class EnvPage:
         """Raises `InputError` where viser is missing, or no port is free."""
         if find_spec("viser") is None:
             raise InputError("render_mode 'viser' needs viser; pip install fastrod[viewer] brings it.")
-        self._served = serve_guarded(_HOST, _free_port(), label=f"fastrod {task.name}")
+        self._served = serve_guarded(_HOST, free_port(_HOST, None), label=f"fastrod {task.name}")
         self._server, self.address = self._served.viser, self._served.address
         self._drawn: dict[str, tuple[Any, Floats]] = {}
         first = task.backdrop(0)
@@ -164,15 +162,3 @@ def _places(n: int, width: float) -> Floats:
     i = np.arange(n)
     places = width * np.stack([i % columns, i // columns, np.zeros(n)], axis=1)
     return np.asarray(places - 0.5 * (places.min(0) + places.max(0)))
-
-
-def _free_port() -> int:
-    """The first from 8080 on. Raises `InputError`."""
-    for port in range(_PORT, _PORT + _TRIES):
-        with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((_HOST, port))
-            return port
-    raise InputError(
-        f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {_HOST}; close a page to free one."
-    )
