@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
@@ -62,10 +61,10 @@ class PushCell(Cell):
         robot: Robot,
         options: PushOptions,
         duration: float,
-        picture_world: Callable[[], Bullet],
+        picture_world: Callable[[], Bullet] | None,
     ) -> None:
-        """`robot` before it is randomised; `duration` of an environment step [s]; `picture_world` makes the
-        world for pictures."""
+        """`robot` before it is randomised; `duration` of an environment step [s]; `picture_world` makes a
+        world for pictures, without robot and cube, where there is more to see than the backdrop."""
         self.course, self.options, self._picture_world = course, options, picture_world
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
@@ -193,8 +192,10 @@ class PushCell(Cell):
         )
 
     def picture(self, width: int, height: int) -> np.ndarray:
-        """(height, width, 3) uint8, from the course's right, of a second world that is made for pictures when
-        the first is asked for."""
+        """(height, width, 3) uint8, from the course's right: of a second world that is made for pictures when
+        the first is asked for, or of the backdrop."""
+        if self._picture_world is None:
+            return super().picture(width, height)
         course = self.course
         if self._studio is None:
             self._studio = self._picture_world()
@@ -325,6 +326,8 @@ class PushTask(HostedTask):
     n_draws: ClassVar[int] = 5
     accuracy: float = ACCURACY
     duration: ClassVar[float] = 4.0
+    picture_world: Callable[[], Bullet] | None = None
+    """As in `PushCell`."""
 
     def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:
         self.course = course
@@ -368,10 +371,6 @@ class PushTask(HostedTask):
             Field("touched", "", (0.0,), (1.0,), "the robot has touched the cube in this episode"),
         )
         super().__init__(n_envs, options, course.robot, actions, states, (goal,))
-
-    @abstractmethod
-    def picture_world(self) -> Bullet:
-        """A world for pictures, without robot and cube."""
 
     def cell(self) -> Cell:
         """A `PushCell` with this course, these options, and the robot as it is before it is randomised."""
