@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import io
 import ipaddress
 import logging
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 MOST_PAGES = 32
 """Open at once on one server: as many as viser has threads for what they send."""
 _LOCAL = ("127.0.0.1", "localhost", "[::1]")
+_PORT, _TRIES = 8080, 20  # the first that is tried, and how many after it
 _HTTP_PORT = 80  # a browser leaves it out of Host and Origin
 _NO_KEY = "This address lacks the key to the page: open the address that was printed in the terminal."
 _WRONG_HOST = (
@@ -216,6 +218,47 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
     for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel
         server._websock_server.unregister_handler(kind)
     return served
+
+
+def free_port(host: str, port: int | None) -> int:
+    """`port` if it is free, or for None the first free one from 8080 on. Raises `InputError`, one sentence,
+    where there is none."""
+    if port is not None and not 0 <= port < 65536:
+        raise InputError(f"port is {port}; it must be between 1 and 65535, or 0 for any that is free.")
+    for candidate in range(_PORT, _PORT + _TRIES) if port is None else [port]:
+        if _free(host, candidate):
+            return candidate
+    if port is None:
+        raise InputError(
+            f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {host}; free one, or name another."
+        )
+    other = next((p for p in range(port + 1, min(port + 1 + _TRIES, 65536)) if _free(host, p)), None)
+    raise InputError(
+        f"port {port} is in use on {host}; "
+        + (f"{other} is free: --port {other}." if other else "name another with --port.")
+    )
+
+
+def _free(host: str, port: int) -> bool:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    except OSError as error:
+        raise InputError(
+            f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of "
+            "its addresses."
+        ) from error
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise InputError(
+                    f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for "
+                    "all of its addresses."
+                ) from error
+            return False
+    return True
 
 
 def is_loopback(host: str) -> bool:

@@ -25,17 +25,15 @@ from fastrod_device.camera import CameraFrame, FrameSource
 from fastrod_device.clock import Clock, WallClock
 from fastrod_device.drives import Drives, open_drives
 from fastrod_device.errors import DeviceError, RefusedError
-from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
-from fastrod_device.gates import FROZEN, REPEATED, Workspace
+from fastrod_device.gates import FROZEN, REPEATED, Expectation, Workspace
 from fastrod_device.hardware import Hardware
 from fastrod_device.homing import home
 from fastrod_device.journal import Journal
 from fastrod_device.pacer import Pacer, urgent, urgently
-from fastrod_device.readings import Readings
+from fastrod_device.readings import Readings, Trace
 from fastrod_device.safety import CameraWatch, Fault, SafetyState, Supervisor, limited
 from fastrod_device.safety_words import of_exception
-from fastrod_device.trace import Trace
 from fastrod_device.tracker import MarkerSighting, MarkerTracker, outlined
 from fastrod_device.units import Transmission
 

@@ -1,7 +1,7 @@
 """Tip control: trajectories, the kinematics of a soft robot on a base that moves, and resolved rates."""
 
 from fastrod.control.kinematics import Arm, BaseKinematics, FixedBase, MovingBase, SoftTip
-from fastrod.control.resolved_rate import ResolvedRate
+from fastrod.control.resolved_rate import ResolvedRate, scaled_rates
 from fastrod.control.trajectories import (
     Trajectory,
     circle,
@@ -28,6 +28,7 @@ __all__ = [
     "helix",
     "names",
     "references",
+    "scaled_rates",
     "square",
     "square_helix",
     "trajectory",

@@ -1,5 +1,5 @@
 """Resolved-rate control: rates of the coordinates that move a tip toward its goal, within the limits of
-both."""
+both; of one robot (`ResolvedRate`), and of a batch that is only scaled at its limits (`scaled_rates`)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 
 _RANK = 1e-9  # of the largest singular value: below it, no coordinate moves the task in that direction
+_STILL = 1e-9  # of a rate, or 1/s: between limits as near as this, nothing moves
 _ROOM = 1e-12  # of a rate: nearer to its limit is at it
 
 
@@ -25,9 +26,9 @@ class ResolvedRate:
     J# is the pseudo-inverse of least sum of weight q_dot^2. Near a singularity, where the smallest singular
     value s of the weighted Jacobian is below `threshold`, it is damped by l^2 = (1 - (s / threshold)^2)
     damping^2: s / (s^2 + l^2) in the place of 1 / s.
-    Source: Whitney 1969 (resolved rates); Nakamura and
-    Hanafusa 1986, Maciejewski and Klein 1988 (damping near a singularity alone); Flacco, De Luca and Khatib
-    2012 (saturation in the null space).
+    Source: Whitney 1969 (resolved rates); Wampler 1986, Nakamura and Hanafusa 1986 (damped least squares);
+    Maciejewski and Klein 1988 (damping near a singularity alone); Flacco, De Luca and Khatib 2012 (saturation
+    in the null space).
 
     >>> ResolvedRate(gain=2.0).rates([0.0, 0.0], [[1.0, 0.0]], [0.1], [0.0], 0.01).tolist()
     [0.2, 0.0]
@@ -38,7 +39,8 @@ class ResolvedRate:
     damping: float = 1e-2
     """Largest damping l, at a singular Jacobian; the unit of the weighted Jacobian. 0: none."""
     threshold: float | None = None
-    """Singular value below which damping sets in; by default `damping`."""
+    """Singular value below which damping sets in; by default `damping`. Infinite: the same damping
+    everywhere."""
     lower: ArrayLike | None = None
     """(n_q,) least q; None: no limit."""
     upper: ArrayLike | None = None
@@ -54,6 +56,9 @@ class ResolvedRate:
     """(n_q,) where q goes as far as the task leaves it free; None: nowhere."""
     posture_gain: float = 1.0
     """Of posture - q [1/s]."""
+    nearest: bool = False
+    """Of all rates within the limits, those of least |J q_dot - task|^2 + damping^2 sum of weight q_dot^2:
+    what is beyond the limits is followed partly, in any direction. False: the direction is kept."""
     _n_q: int | None = field(init=False, repr=False, default=None)
     _most: Floats = field(init=False, repr=False)
     """(n_q,) or one number: `rate`, infinite where there is none."""
@@ -69,10 +74,12 @@ class ResolvedRate:
                 )
         for name in ("threshold", "error_limit"):
             value = getattr(self, name)
-            if value is not None and (not _is_number(value) or value <= 0.0):
+            if value is not None and not ((_is_number(value) or value == math.inf) and value > 0.0):
                 raise InputError(
-                    f"ResolvedRate.{name} is {value!r} m; it must be a number, positive and finite, or None."
+                    f"ResolvedRate.{name} is {value!r} m; it must be a positive number, or None."
                 )
+        if self.nearest and self.posture is not None:
+            raise InputError("ResolvedRate has a posture, for which nearest leaves no room; give one.")
         sizes: dict[str, int] = {}
         for name in ("lower", "upper", "rate", "weight", "posture"):
             value = getattr(self, name)
@@ -153,6 +160,8 @@ class ResolvedRate:
         task = feedforward + self.gain * error
         wish = None if self.posture is None else self.posture_gain * (cast(Floats, self.posture) - q)
         low, high = self._range(q, dt)
+        if self.nearest:
+            return self._nearest(J, task, low, high)
         inverse, free = self._inverse(J, None, wish is not None)
         by_task = inverse @ task
         rates = by_task if free is None or wish is None else by_task + free @ wish
@@ -163,18 +172,21 @@ class ResolvedRate:
 
     def _range(self, q: Floats, dt: float) -> tuple[Floats, Floats]:
         """(n_q,) least and largest rates."""
-        most = self._most if self._most.shape == q.shape else np.broadcast_to(self._most, q.shape)
-        low = (
-            -most
-            if self.lower is None
-            else np.minimum(np.maximum((cast(Floats, self.lower) - q) / dt, -most), most)
-        )
-        high = (
-            most
-            if self.upper is None
-            else np.minimum(np.maximum((cast(Floats, self.upper) - q) / dt, -most), most)
-        )
-        return low, high
+        most = np.broadcast_to(self._most, q.shape)
+        lower = -math.inf if self.lower is None else cast(Floats, self.lower)
+        upper = math.inf if self.upper is None else cast(Floats, self.upper)
+        return np.clip((lower - q) / dt, -most, most), np.clip((upper - q) / dt, -most, most)
+
+    def _nearest(self, J: Floats, task: Floats, low: Floats, high: Floats) -> Floats:
+        from scipy.optimize import lsq_linear
+
+        moves = high - low > _STILL * np.minimum(self._most, 1.0)
+        rates, n = np.zeros(len(low)), int(moves.sum())
+        root = np.ones(n) if self._root is None else self._root[moves]  # unknowns of one size
+        rows = np.concatenate([J[:, moves] * root, self.damping * np.eye(n)])
+        goal, ends = np.concatenate([task, np.zeros(n)]), (low[moves] / root, high[moves] / root)
+        rates[moves] = root * lsq_linear(rows, goal, ends, method="bvls").x
+        return rates
 
     def _inverse(self, J: Floats, active: Flags | None, projector: bool) -> tuple[Floats, Floats | None]:
         """(n_q, m) weighted pseudo-inverse, damped, or undamped by the coordinates `active`; where requested,
@@ -250,6 +262,18 @@ def _step_fraction(step: Floats, rest: Floats, low: Floats, high: Floats, active
     if fraction < max(0.0, float(least.max())) - _ROOM:
         fraction = -1.0
     return fraction, worst if key[worst] < 1.0 else -1
+
+
+def scaled_rates(jacobian: Floats, velocity: Floats, wish: Floats) -> Floats:
+    """(n, n_q) rates of a batch that give the velocities (n, m), a row scaled where one is beyond -1 or 1:
+    damped pseudo-inverse of `jacobian` (n, m, n_q), and in its null space slowly toward `wish` (n, n_q)."""
+    transposed = np.swapaxes(jacobian, 1, 2)
+    square = jacobian @ transposed
+    damping = 1e-3 * np.trace(square, axis1=1, axis2=2) + 1e-12
+    inverse = transposed @ np.linalg.inv(square + damping[:, None, None] * np.eye(jacobian.shape[1]))
+    free = 0.2 * (wish - (inverse @ (jacobian @ wish[:, :, None]))[:, :, 0])
+    rates = (inverse @ velocity[:, :, None])[:, :, 0] + free
+    return np.asarray(rates / np.maximum(np.abs(rates).max(1, keepdims=True), 1.0))
 
 
 def _is_number(value: object) -> bool:

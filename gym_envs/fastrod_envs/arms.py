@@ -1,5 +1,4 @@
-"""What the tasks with arms share: a soft robot whose base is commanded where to be, and how arms and boxes
-are drawn."""
+"""What the tasks with arms share: a soft robot whose base is commanded where to be; how arms are drawn."""
 
 from __future__ import annotations
 
@@ -15,26 +14,7 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
-from fastrod_envs.task import Solid, Tube
-
-_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-_FACES = np.array(
-    [
-        [0, 1, 3],
-        [0, 3, 2],
-        [4, 6, 7],
-        [4, 7, 5],
-        [0, 4, 5],
-        [0, 5, 1],
-        [2, 3, 7],
-        [2, 7, 6],
-        [0, 2, 6],
-        [0, 6, 4],
-        [1, 5, 7],
-        [1, 7, 3],
-    ]
-)
-_UPRIGHT = np.eye(3)
+from fastrod_envs.task import Tube
 
 
 @final
@@ -146,20 +126,6 @@ class SoftArm:
 def short(vector: Floats, longest: float) -> Floats:
     """A vector (3,) of at most this length, its direction kept."""
     return np.asarray(vector * (longest / max(float(np.linalg.norm(vector)), longest)))
-
-
-def solid_box(
-    middle: ArrayLike,
-    half: ArrayLike,
-    color: tuple[float, float, float],
-    rotation: Floats = _UPRIGHT,
-    opacity: float = 1.0,
-) -> Solid:
-    """A box to draw: its `middle` (3,) world [m], `half` of its edges (3,) [m], `rotation` (3, 3)
-    world_from_box."""
-    return Solid(
-        np.asarray(middle, float) + (_CORNERS * np.asarray(half, float)) @ rotation.T, _FACES, color, opacity
-    )
 
 
 def arm_tube(arm: BulletArm) -> Tube:

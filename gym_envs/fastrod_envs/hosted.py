@@ -13,6 +13,7 @@ from fastrod.errors import HostError
 from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
 from fastrod_envs.options import EnvOptions
+from fastrod_envs.painter import paint
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.task import Backdrop, Field, Outcome, Task
 
@@ -63,11 +64,11 @@ class Cell(ABC):
 
     @abstractmethod
     def backdrop(self) -> Backdrop:
-        """What it looks like, for the page; pictures come from PyBullet."""
+        """What it looks like, for the page."""
 
-    @abstractmethod
     def picture(self, width: int, height: int) -> np.ndarray:
-        """(height, width, 3) uint8."""
+        """(height, width, 3) uint8: the backdrop, unless a cell has a world with more to see."""
+        return paint(self.backdrop(), width, height)
 
     @abstractmethod
     def close(self) -> None:
@@ -175,7 +176,7 @@ class HostedTask(Task):
         return self.cells[i].backdrop()
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:
-        """(height, width, 3) uint8 by PyBullet's camera; never None."""
+        """(height, width, 3) uint8 as cell i gives it; never None."""
         return self.cells[i].picture(width, height)
 
     def close(self) -> None:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import socket
 import sys
 from importlib.util import find_spec
 from typing import Any, final
 
 import numpy as np
 
-from fastrod.access import serve_guarded
+from fastrod.access import free_port, serve_guarded
 from fastrod.errors import InputError
 from fastrod.types import Floats
-from fastrod_envs.painter import ball_mesh, tube_mesh
+from fastrod_envs.painter import DrawnPiece, pieces
 from fastrod_envs.task import Backdrop, Task
 
 SHOWN = 16
 """Environments that are shown, at most."""
-_HOST, _PORT, _TRIES = "127.0.0.1", 8080, 20
+_HOST = "127.0.0.1"
 _STILL = 1e-7  # m: what has moved by less is not sent again
 _LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
 
@@ -33,7 +31,7 @@ class EnvPage:
         """Raises `InputError` where viser is missing, or no port is free."""
         if find_spec("viser") is None:
             raise InputError("render_mode 'viser' needs viser; pip install fastrod[viewer] brings it.")
-        self._served = serve_guarded(_HOST, _free_port(), label=f"fastrod {task.name}")
+        self._served = serve_guarded(_HOST, free_port(_HOST, None), label=f"fastrod {task.name}")
         self._server, self.address = self._served.viser, self._served.address
         self._drawn: dict[str, tuple[Any, Floats]] = {}
         first = task.backdrop(0)
@@ -93,50 +91,34 @@ class EnvPage:
     def _draw(self, at: str, backdrop: Backdrop) -> list[str]:
         """Everything of one environment; the names it has in the page."""
         names = []
-        for i, tube in enumerate(backdrop.tubes):
-            names.append(f"{at}/tube{i}")
-            self._mesh(names[-1], *tube_mesh(tube.points, tube.radius, 16), tube.color, 1.0, flat=False)
-        for i, ball in enumerate(backdrop.balls):
-            names.append(f"{at}/ball{i}")
-            mesh = ball_mesh()
-            self._mesh(
-                names[-1],
-                np.asarray(ball.position) + ball.radius * mesh.vertices,
-                mesh.faces,
-                ball.color,
-                1.0,
-                flat=False,
-            )
-        for i, solid in enumerate(backdrop.solids):
-            names.append(f"{at}/solid{i}")
-            self._mesh(names[-1], solid.vertices, solid.faces, solid.color, solid.opacity, flat=True)
+        for piece in pieces(backdrop, sides=16, n_points=2):
+            names.append(f"{at}/{piece.name}")
+            self._mesh(names[-1], piece)
         for i, line in enumerate(backdrop.lines):
             names.append(f"{at}/line{i}")
             points = np.asarray(line.points, float)
             self._line(names[-1], np.stack([points[:-1], points[1:]], axis=1), line.color)
         return names
 
-    def _mesh(
-        self, name: str, vertices: Floats, faces: Any, color: tuple[float, ...], opacity: float, *, flat: bool
-    ) -> None:
-        handle = self._known(name, vertices)
+    def _mesh(self, name: str, piece: DrawnPiece) -> None:
+        handle = self._known(name, piece.vertices)
         if handle is None:
             handle = self._server.scene.add_mesh_simple(
                 name,
-                np.asarray(vertices, np.float32),
-                np.asarray(faces, np.uint32),
-                color=_bytes(color),
-                opacity=None if opacity >= 1.0 else opacity,
-                flat_shading=flat,
+                piece.vertices.astype(np.float32),
+                piece.faces.astype(np.uint32),
+                color=_bytes(piece.color),
+                opacity=None if piece.opacity >= 1.0 else piece.opacity,
+                flat_shading=piece.flat,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-        elif np.abs(self._drawn[name][1] - vertices).max() > _STILL:
-            handle.vertices = np.asarray(vertices, np.float32)
+        elif np.abs(self._drawn[name][1] - piece.vertices).max() > _STILL:
+            handle.vertices = piece.vertices.astype(np.float32)
         else:
             return
-        self._drawn[name] = handle, np.array(vertices)
+        self._drawn[name] = handle, piece.vertices
 
     def _line(self, name: str, pairs: Floats, color: tuple[float, ...]) -> None:
         handle = self._known(name, pairs)
@@ -180,15 +162,3 @@ def _places(n: int, width: float) -> Floats:
     i = np.arange(n)
     places = width * np.stack([i % columns, i // columns, np.zeros(n)], axis=1)
     return np.asarray(places - 0.5 * (places.min(0) + places.max(0)))
-
-
-def _free_port() -> int:
-    """The first from 8080 on. Raises `InputError`."""
-    for port in range(_PORT, _PORT + _TRIES):
-        with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((_HOST, port))
-            return port
-    raise InputError(
-        f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {_HOST}; close a page to free one."
-    )

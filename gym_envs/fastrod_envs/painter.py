@@ -1,22 +1,24 @@
-"""A small painter in numpy: what a `Backdrop` looks like, in some milliseconds, without a window or a
-graphics card.
+"""What a `Backdrop` is drawn of (`pieces`), and a small painter: what it looks like, in some milliseconds,
+without a window or a graphics card.
 
-Everything becomes triangles. Those of one layer are cut into rows of pixels, and rows into fragments, at
-twice the picture's resolution; the nearest fragment of every pixel is kept and only then shaded. See-through
-solids are layers of their own, laid over what is opaque.
+Everything becomes triangles. Of one layer the nearest triangle at every pixel is found, at twice the
+picture's resolution, and only then shaded. See-through solids are layers of their own, laid over what is
+opaque.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fastrod.kernels.jit import entry, kernel
 from fastrod.types import Floats, Ints
-from fastrod_envs.task import Backdrop, Ball, DrawnLine, Solid, Tube
+from fastrod_envs.task import Backdrop, DrawnLine
 
 _FIELD_OF_VIEW = math.radians(36.0)  # from bottom to top
 _NEAR = 0.02  # m before the eye: nothing nearer is drawn
@@ -28,6 +30,8 @@ _SKY, _HORIZON, _FLOOR, _GRID = (
 )
 _MOUNT = (0.30, 0.33, 0.38)
 _SQUARE, _FOG = 0.1, 1.6  # m: of the grid; where the floor fades into the horizon
+_Vector: TypeAlias = tuple[float, float, float]
+_NONE: _Vector = (0.0, 0.0, 0.0)
 
 
 class PaintedMesh(NamedTuple):
@@ -37,6 +41,21 @@ class PaintedMesh(NamedTuple):
     """(n, 3) world [m]."""
     faces: Ints
     """(m, 3) counter-clockwise from outside."""
+
+
+class DrawnPiece(NamedTuple):
+    """A mesh with its looks."""
+
+    name: str
+    """The same from picture to picture."""
+    vertices: Floats
+    """(n, 3) world [m]."""
+    faces: Ints
+    """(m, 3)"""
+    color: tuple[float, float, float]
+    opacity: float = 1.0
+    flat: bool = False
+    """Its edges show."""
 
 
 class Layer(NamedTuple):
@@ -84,23 +103,33 @@ def paint(backdrop: Backdrop, width: int, height: int) -> np.ndarray:
     # a step at a time, so that it stays under what moves
     floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)
     camera = _camera(backdrop.eye, backdrop.target, width, height)
-    opaque = [
-        _lit(PaintedMesh(s.vertices, s.faces), s.color, True) for s in backdrop.solids if s.opacity >= 1.0
-    ]
-    opaque += [layer for tube in backdrop.tubes for layer in _tube_layers(tube)]
-    opaque += [_ball_layer(ball) for ball in backdrop.balls]
-    solid = _joined([layer for layer in opaque if len(layer.corners)])
+    drawn = list(pieces(backdrop))
+    solid = _joined([_lit(piece) for piece in drawn if piece.opacity >= 1.0])
     picture = (
         _ground(backdrop.eye, backdrop.target, width, height, floor)
         * _shadow(solid, camera, floor)[:, :, None]
     )
     ribbons = [_ribbon(line, camera) for line in backdrop.lines if len(line.points) > 1]
-    layers = [(_joined([solid, *ribbons]), 1.0)] + [
-        (_lit(PaintedMesh(s.vertices, s.faces), s.color, True), s.opacity)
-        for s in _far_to_near(backdrop, camera)
-    ]
-    _lay(picture.reshape(-1, 3), layers, camera)
+    clear = [piece for piece in drawn if piece.opacity < 1.0]
+    clear.sort(key=lambda piece: -float(np.linalg.norm(piece.vertices.mean(0) - camera.eye)))
+    layers = [(_joined([solid, *ribbons]), 1.0), *((_lit(piece), piece.opacity) for piece in clear)]
+    _lay(picture, layers, camera)
     return np.asarray(np.clip(255.0 * picture + 0.5, 0.0, 255.0).astype(np.uint8))
+
+
+def pieces(backdrop: Backdrop, sides: int = _SIDES, n_points: int = 50) -> Iterator[DrawnPiece]:
+    """Everything but the lines: rods of at least `n_points`, the plates that they stand on, balls, solids."""
+    for i, tube in enumerate(backdrop.tubes):
+        points = _smooth(np.asarray(tube.points, float), n_points)
+        if len(points) > 1 and np.isfinite(points).all():
+            yield DrawnPiece(f"tube{i}", *tube_mesh(points, tube.radius, sides), tube.color)
+            yield DrawnPiece(f"plate{i}", *_plate(points, tube.radius), _MOUNT, flat=True)
+    for i, ball in enumerate(backdrop.balls):
+        mesh = ball_mesh()
+        at = np.asarray(ball.position) + ball.radius * mesh.vertices
+        yield DrawnPiece(f"ball{i}", at, mesh.faces, ball.color)
+    for i, solid in enumerate(backdrop.solids):
+        yield DrawnPiece(f"solid{i}", np.array(solid.vertices, float), *solid[1:], flat=True)
 
 
 def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> PaintedMesh:
@@ -195,9 +224,7 @@ def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
     if not len(layer.corners) or camera.eye[2] <= floor:
         return light
     corners = layer.corners - ((layer.corners[:, :, 2:] - floor) / _LIGHT[2]) * _LIGHT
-    pixel, _, _ = _fragments(*_projected(corners, camera), camera.width, camera.height)
-    dark = np.zeros((camera.height, camera.width))
-    dark.reshape(-1)[pixel] = 1.0
+    dark = (_nearest(*_projected(corners, camera), camera)[1] >= 0).astype(float)
     rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
     if not len(rows):
         return light
@@ -214,42 +241,21 @@ def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
     return light
 
 
-def _tube_layers(tube: Tube) -> list[Layer]:
-    """The rod, and the plate that it stands on."""
-    points = _smooth(np.asarray(tube.points, float))
-    if len(points) < 2 or not np.isfinite(points).all():
-        return []
-    body = tube_mesh(points, tube.radius)
-    centre = np.concatenate([points, np.repeat(points[-1:], 5, axis=0)]).repeat(_SIDES, axis=0)
-    normals = (body.vertices - centre) / tube.radius
-    color = np.broadcast_to(np.array(tube.color, float), (len(body.faces), 3))
+def _plate(points: Floats, radius: float) -> PaintedMesh:
+    """What a rod along these points stands on."""
     along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    return [
-        Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))),
-        _plate(points[0], along, tube.radius),
-    ]
-
-
-def _plate(bottom: Floats, along: Floats, radius: float) -> Layer:
-    """What a rod of this radius stands on."""
-    ends = np.array([bottom - 0.7 * radius * along, bottom])
-    rim = tube_mesh(ends, 2.2 * radius, 2 * _SIDES).vertices[: 4 * _SIDES].reshape(2, 2 * _SIDES, 3)
-    outward = (rim[1] - bottom) / (2.2 * radius)
-    rings = np.concatenate(
-        [np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)]
+    ends, n = np.array([points[0] - 0.7 * radius * along, points[0]]), 2 * _SIDES
+    rim = tube_mesh(ends, 2.2 * radius, n).vertices[: 2 * n].reshape(2, n, 3)
+    middle = np.repeat(ends[:, None], n, axis=1)
+    rings = np.stack([middle[0], rim[0], *rim, rim[1], middle[1]])  # below, around, above: edges show
+    return PaintedMesh(
+        rings.reshape(-1, 3), np.concatenate([_grid_faces(2, n) + 2 * n * k for k in range(3)])
     )
-    faces = _grid_faces(4, 2 * _SIDES)
-    # lower side, rim, upper side
-    normals = np.broadcast_to(-along, (*faces.shape, 3)).reshape(3, -1, 3, 3).copy()
-    normals[1] = outward[faces.reshape(3, -1, 3)[1] % (2 * _SIDES)]
-    normals[2] = along
-    color = np.broadcast_to(np.array(_MOUNT), (len(faces), 3))
-    return Layer(rings.reshape(-1, 3)[faces], normals.reshape(-1, 3, 3), color, np.ones(len(faces)))
 
 
-def _smooth(points: Floats) -> Floats:
-    """A curve with points between points, where there are few (Catmull and Rom)."""
-    while 2 < len(points) < 50:
+def _smooth(points: Floats, n_points: int) -> Floats:
+    """A curve with points between points, where there are fewer (Catmull and Rom)."""
+    while 2 < len(points) < n_points:
         slope = np.gradient(points, axis=0)
         between = 0.5 * (points[:-1] + points[1:]) + 0.125 * (slope[:-1] - slope[1:])
         merged = np.empty((2 * len(points) - 1, 3))
@@ -258,27 +264,18 @@ def _smooth(points: Floats) -> Floats:
     return points
 
 
-def _ball_layer(ball: Ball) -> Layer:
-    mesh = ball_mesh()
-    corners = mesh.vertices[mesh.faces]
-    color = np.broadcast_to(np.array(ball.color, float), (len(corners), 3))
-    return Layer(np.asarray(ball.position) + ball.radius * corners, corners, color, np.ones(len(corners)))
-
-
-def _lit(mesh: PaintedMesh, color: tuple[float, ...], rounded: bool) -> Layer:
-    """Triangles under the light; `rounded`: smooth where neighbours are nearly in one plane, so that only
-    edges show."""
-    corners = np.asarray(mesh.vertices, float)[mesh.faces]
+def _lit(piece: DrawnPiece) -> Layer:
+    """Triangles under the light: smooth where neighbours are nearly in one plane, so that only edges show."""
+    faces = piece.faces
+    corners = piece.vertices[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-18)
-    normals = np.repeat(flat[:, None], 3, axis=1)
-    if rounded:
-        n, corner = len(mesh.vertices), mesh.faces.ravel()
-        mean = np.stack([np.bincount(corner, np.repeat(area[:, k], 3), n) for k in range(3)], axis=1)
-        mean = (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-18))[mesh.faces]
-        normals = np.where(((mean * normals).sum(2) > 0.9)[:, :, None], mean, normals)
+    normals, n = np.repeat(flat[:, None], 3, axis=1), len(piece.vertices)
+    mean = np.stack([np.bincount(faces.ravel(), np.repeat(area[:, k], 3), n) for k in range(3)], axis=1)
+    mean = (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-18))[faces]
+    normals = np.where(((mean * normals).sum(2) > 0.9)[:, :, None], mean, normals)
     return Layer(
-        corners, normals, np.broadcast_to(np.array(color, float), (len(corners), 3)), np.ones(len(corners))
+        corners, normals, np.tile(np.array(piece.color, float), (len(faces), 1)), np.ones(len(faces))
     )
 
 
@@ -294,21 +291,14 @@ def _ribbon(line: DrawnLine, camera: PainterCamera) -> Layer:
     faces = np.concatenate(
         [np.stack([i, i + 1, i + len(p)], 1), np.stack([i + 1, i + len(p) + 1, i + len(p)], 1)]
     )
-    layer = _lit(PaintedMesh(np.concatenate([p - side, p + side]), faces), line.color, False)
-    return layer._replace(shade=np.zeros(len(faces)))
+    color = np.tile(np.array(line.color, float), (len(faces), 1))
+    corners = np.concatenate([p - side, p + side])[faces]
+    return Layer(corners, np.zeros_like(corners), color, np.zeros(len(faces)))
 
 
 def _joined(layers: list[Layer]) -> Layer:
     empty = Layer(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
     return Layer(*(np.concatenate(arrays) for arrays in zip(empty, *layers, strict=True)))
-
-
-def _far_to_near(backdrop: Backdrop, camera: PainterCamera) -> list[Solid]:
-    """Solids that one sees through."""
-    clear = [solid for solid in backdrop.solids if solid.opacity < 1.0]
-    return sorted(
-        clear, key=lambda solid: -float(np.linalg.norm(np.asarray(solid.vertices).mean(0) - camera.eye))
-    )
 
 
 def _projected(corners: Floats, camera: PainterCamera) -> tuple[Floats, Floats]:
@@ -322,137 +312,100 @@ def _projected(corners: Floats, camera: PainterCamera) -> tuple[Floats, Floats]:
     return middle + camera.focus * seen[:, :, :2] * inverse[:, :, None], np.where(visible, inverse, 0.0)
 
 
-def _fragments(at: Floats, inverse: Floats, width: int, height: int) -> tuple[Ints, Ints, Floats]:
-    """Pixel, triangle and one over depth of every pixel centre within every triangle."""
-    a, b = at[:, [1, 2, 0], 1] - at[:, :, 1], at[:, :, 0] - at[:, [1, 2, 0], 0]
-    double = a[:, 0] * (at[:, 2, 0] - at[:, 0, 0]) + b[:, 0] * (at[:, 2, 1] - at[:, 0, 1])
-    top = np.maximum(np.ceil(at[:, :, 1].min(1) - 0.5), 0.0)
-    rows = np.minimum(np.floor(at[:, :, 1].max(1) - 0.5), height - 1.0) - top + 1.0
-    rows = np.where((np.abs(double) > 1e-9) & (inverse[:, 0] > 0.0), np.maximum(rows, 0.0), 0.0).astype(
-        np.int64
-    )
-    triangle, y = _counted(rows)
-    y += top[triangle].astype(np.int64)
-    sign = np.sign(double)[:, None]
-    a, b = sign * a, sign * b
-    c = -(a * at[:, :, 0] + b * at[:, :, 1])
-    with np.errstate(divide="ignore", invalid="ignore"):  # a row crosses no edge that is level
-        crossing = -(b[triangle] * (y[:, None] + 0.5) + c[triangle]) / a[triangle]
-    enters, leaves = (
-        np.where(a[triangle] > 0.0, crossing, 0.0),
-        np.where(a[triangle] < 0.0, crossing, float(width)),
-    )
-    left = np.maximum(np.maximum(enters[:, 0], enters[:, 1]), np.maximum(enters[:, 2], 0.0))
-    right = np.minimum(np.minimum(leaves[:, 0], leaves[:, 1]), leaves[:, 2])
-    first = np.ceil(left - 0.5)
-    row, x = _counted(
-        np.maximum(np.minimum(np.floor(right - 0.5), width - 1.0) - first + 1.0, 0.0).astype(np.int64)
-    )
-    x += first[row].astype(np.int64)
-    triangle, y = triangle[row], y[row]
-    e, f = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
-    de, df = inverse[:, 1] - inverse[:, 0], inverse[:, 2] - inverse[:, 0]
-    whole = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
-    whole = np.where(whole == 0.0, 1.0, whole)
-    slope_x, slope_y = (de * f[:, 1] - df * e[:, 1]) / whole, (df * e[:, 0] - de * f[:, 0]) / whole
-    start = inverse[:, 0] - slope_x * (at[:, 0, 0] - 0.5) - slope_y * (at[:, 0, 1] - 0.5)
-    return y * width + x, triangle, start[triangle] + slope_x[triangle] * x + slope_y[triangle] * y
-
-
-def _counted(counts: Ints) -> tuple[Ints, Ints]:
-    """Each index so often as its count says, and which of its times it is."""
-    index = np.repeat(np.arange(len(counts)), counts)
-    return index, np.arange(len(index)) - (np.cumsum(counts) - counts)[index]
-
-
-def _nearest(pixel: Ints, inverse: Floats, size: int) -> tuple[Ints, Ints]:
-    """The pixels that are covered, and the nearest fragment of each."""
-    key = (inverse.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
-        len(pixel), dtype=np.uint64
-    )
-    best = np.zeros(size, np.uint64)
-    np.maximum.at(best, pixel, key)
-    covered = np.flatnonzero(best)
-    return covered, (best[covered] & np.uint64(0xFFFFFFFF)).astype(np.int64)
-
-
 def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: PainterCamera) -> None:
-    """Lay triangles over a picture (height * width, 3), each layer over those before it where it is nearer
+    """Lay triangles over a picture (height, width, 3), each layer over those before it where it is nearer
     than the first."""
     fine = camera._replace(width=_FINE * camera.width, height=_FINE * camera.height)
-    found = []
-    for layer, opacity in layers:
+    color = picture.repeat(_FINE, axis=0).repeat(_FINE, axis=1)
+    first = np.zeros((fine.height, fine.width), np.float32)
+    for k, (layer, opacity) in enumerate(layers):
         at, inverse = _projected(layer.corners, fine)
-        pixel, triangle, depth = _fragments(at, inverse, fine.width, fine.height)
-        covered, which = _nearest(pixel, depth, fine.width * fine.height)
-        triangle = triangle[which]
-        # the left one of two neighbours within a pixel and a triangle is shaded for both
-        alone = np.ones(len(covered), np.bool_)
-        alone[1:] = (
-            (triangle[1:] != triangle[:-1]) | (covered[1:] != covered[:-1] + 1) | (covered[1:] % _FINE == 0)
-        )
-        shaded = _shaded(layer, covered[alone], triangle[alone], at, inverse, fine)[np.cumsum(alone) - 1]
-        found.append((covered, depth[which], shaded, opacity))
-    mark = np.zeros(fine.width * fine.height, np.bool_)
-    for covered, *_ in found:
-        mark[covered] = True
-    touched = np.flatnonzero(mark)
-    places = np.empty(len(mark), np.int32)
-    places[touched] = np.arange(len(touched))
-    parent = (touched // fine.width // _FINE) * camera.width + touched % fine.width // _FINE
-    behind = picture[parent].astype(np.float32)
-    color, depth_of = behind.copy(), np.zeros(len(touched))
-    for k, (covered, depth, shaded, opacity) in enumerate(found):
-        place = places[covered]
-        if k == 0:
-            depth_of[place] = depth
-            color[place] = shaded
+        depth, which = _nearest(at, inverse, fine)
+        _shade((depth, which, first), (at, inverse), layer, fine, opacity, (color, picture))
+        first = depth if k == 0 else first
+
+
+def _nearest(at: Floats, inverse: Floats, camera: PainterCamera) -> tuple[NDArray[np.float32], Ints]:
+    """One over the depth of the nearest triangle at every pixel's centre, 0 where there is none, and which it
+    is; both (height, width)."""
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    which = np.full(depth.shape, -1, np.int64)
+    _cover(at, inverse, depth, which)
+    return depth, which
+
+
+@kernel
+def _dot(a: Floats | _Vector, b: Floats | _Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _plus(a: Floats | _Vector, k: float, b: Floats | _Vector) -> _Vector:
+    """a + k b."""
+    return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
+
+
+@kernel
+def _weights(at: Floats, t: int, x: int, y: int) -> _Vector:
+    """Barycentric coordinates of a pixel's centre in triangle t."""
+    x0, y0 = at[t, 0, 0], at[t, 0, 1]
+    ex, ey, fx, fy = at[t, 1, 0] - x0, at[t, 1, 1] - y0, at[t, 2, 0] - x0, at[t, 2, 1] - y0
+    px, py, whole = x + 0.5 - x0, y + 0.5 - y0, ex * fy - ey * fx
+    v, w = (px * fy - py * fx) / whole, (ex * py - ey * px) / whole
+    return 1.0 - v - w, v, w
+
+
+@entry
+def _cover(at: Floats, inverse: Floats, depth: NDArray[np.float32], which: Ints) -> None:
+    height, width = depth.shape
+    for t in range(len(at)):
+        x, y = at[t, :, 0], at[t, :, 1]
+        if inverse[t, 0] <= 0.0 or abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) < 1e-9:
             continue
-        seen = depth >= depth_of[place]
-        place = place[seen]
-        color[place] += opacity * (shaded[seen] - color[place])
-    color -= behind
-    for k in range(3):
-        picture[:, k] += np.bincount(parent, color[:, k], len(picture)) / _FINE**2
+        left, right = max(math.ceil(x.min() - 0.5), 0), min(math.floor(x.max() - 0.5), width - 1)
+        for j in range(max(math.ceil(y.min() - 0.5), 0), min(math.floor(y.max() - 0.5), height - 1) + 1):
+            for i in range(left, right + 1):
+                w = _weights(at, t, i, j)
+                if min(w[0], w[1], w[2]) > -1e-9:
+                    near = np.float32(_dot(w, inverse[t]))
+                    if near >= depth[j, i]:
+                        depth[j, i], which[j, i] = near, t
 
 
-def _shaded(
-    layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floats, camera: PainterCamera
-) -> NDArray[np.float32]:
-    """(n, 3) colour of the triangles at these pixels."""
-    y, x = np.divmod(pixel, camera.width)
-    e, f, start = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0], at[:, 0] - 0.5
-    whole = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
-    whole = np.where(whole == 0.0, 1.0, whole)[:, None, None]
-    # a normal over its depth is linear in the picture, as one over depth is
-    n = layer.normals * inverse[:, :, None]
-    dn = np.stack([n[:, 1] - n[:, 0], n[:, 2] - n[:, 0]], axis=1)
-    by_x = (dn[:, 0] * f[:, 1:] - dn[:, 1] * e[:, 1:]) / whole[:, 0]
-    by_y = (dn[:, 1] * e[:, :1] - dn[:, 0] * f[:, :1]) / whole[:, 0]
-    single = np.concatenate([n[:, 0], by_x, by_y, start, layer.color, layer.shade[:, None]], axis=1).astype(
-        np.float32
-    )[triangle]
-    x, y = x.astype(np.float32), y.astype(np.float32)
-    normal = (
-        single[:, :3]
-        + single[:, 3:6] * (x - single[:, 9])[:, None]
-        + single[:, 6:9] * (y - single[:, 10])[:, None]
-    )
-    view = -camera.rays(x + np.float32(0.5), y + np.float32(0.5)).astype(np.float32)
-    light = _LIGHT.astype(np.float32)
-    size, far, facing = _dot(normal, normal), _dot(view, view), _dot(normal, view)
-    scale = np.where(facing < 0.0, np.float32(-1.0), np.float32(1.0)) / np.sqrt(
-        np.maximum(size, np.float32(1e-18))
-    )
-    view /= np.sqrt(far)[:, None]
-    toward = scale * (normal @ light)
-    half = view + light
-    glance = scale * _dot(normal, half) / np.sqrt(_dot(half, half))
-    shade = single[:, 14]
-    bright = 1.0 + shade * (0.14 * scale * normal[:, 2] + 0.46 * np.maximum(toward, 0.0) - 0.48)
-    gleam = 0.28 * shade * np.maximum(glance, 0.0) ** 48
-    return np.asarray(single[:, 11:14] * bright[:, None] + gleam[:, None], np.float32)
-
-
-def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(np.einsum("nk,nk->n", a, b))
+@entry
+def _shade(
+    seen: tuple[NDArray[np.float32], Ints, NDArray[np.float32]],
+    projected: tuple[Floats, Floats],
+    layer: Layer,
+    camera: PainterCamera,
+    opacity: float,
+    canvas: tuple[Floats, Floats],
+) -> None:
+    """Lay a layer's colour over a canvas, fine and coarse, where it is no farther than the first layer."""
+    (depth, which, first), (at, inverse), (color, picture) = seen, projected, canvas
+    axes, light = camera.axes, _LIGHT
+    focus = 0.5 * camera.height / math.tan(0.5 * _FIELD_OF_VIEW)
+    for j in range(depth.shape[0]):
+        for i in range(depth.shape[1]):
+            t = which[j, i]
+            if t < 0 or depth[j, i] < first[j, i]:
+                continue
+            # a normal over its depth is linear in the picture, as one over depth is
+            w, n, view = _weights(at, t, i, j), _NONE, _plus(_NONE, -1.0, axes[2])
+            for k in range(3):
+                n = _plus(n, w[k] * inverse[t, k], layer.normals[t, k])
+            aside, down = (i + 0.5 - 0.5 * camera.width) / focus, (j + 0.5 - 0.5 * camera.height) / focus
+            view = _plus(view, -aside, axes[0])
+            view = _plus(view, -down, axes[1])
+            view = _plus(_NONE, 1.0 / math.sqrt(_dot(view, view)), view)
+            size = math.sqrt(max(_dot(n, n), 1e-18))
+            n = _plus(_NONE, -1.0 / size if _dot(n, view) < 0.0 else 1.0 / size, n)
+            half = _plus(view, 1.0, light)
+            glance = max(_dot(n, half) / math.sqrt(_dot(half, half)), 0.0)
+            shade = layer.shade[t]
+            bright = 1.0 + shade * (0.14 * n[2] + 0.46 * max(_dot(n, light), 0.0) - 0.48)
+            gleam = 0.28 * shade * glance**48
+            for k in range(3):
+                change = opacity * (layer.color[t, k] * bright + gleam - color[j, i, k])
+                color[j, i, k] += change
+                picture[j // _FINE, i // _FINE, k] += change / _FINE**2

@@ -35,7 +35,7 @@ class PolicyDriver:
     where it is until the tip is seen again.
 
     >>> from fastrod_envs.policies import Policy, find
-    >>> pilot = TrackPilot(Policy(find("Track", "shipped")), "circle")
+    >>> pilot = PolicyDriver(Policy(find("Track", "shipped")), "circle")
     >>> pilot.command([0.0, 0.0, 0.07], 0.0).shape
     (4,)
     """

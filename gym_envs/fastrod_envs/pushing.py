@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import numpy as np
 
+from fastrod.control import scaled_rates
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
@@ -22,9 +22,7 @@ from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, Drive, PushOptions
-from fastrod_envs.rodtask import resolved
-from fastrod_envs.shapes import box_mesh
-from fastrod_envs.task import Backdrop, Ball, Field, Solid, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 
 ACCURACY = 0.02
 """Of the cube's place [m]."""
@@ -63,10 +61,10 @@ class PushCell(Cell):
         robot: Robot,
         options: PushOptions,
         duration: float,
-        picture_world: Callable[[], Bullet],
+        picture_world: Callable[[], Bullet] | None,
     ) -> None:
-        """`robot` before it is randomised; `duration` of an environment step [s]; `picture_world` makes the
-        world for pictures."""
+        """`robot` before it is randomised; `duration` of an environment step [s]; `picture_world` makes a
+        world for pictures, without robot and cube, where there is more to see than the backdrop."""
         self.course, self.options, self._picture_world = course, options, picture_world
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
@@ -172,7 +170,7 @@ class PushCell(Cell):
             [*(ahead * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
         )
         jacobian = drive.jacobian(self.simulator) * drive.rate
-        rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
+        rates = scaled_rates(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
         if self.options.action == "rate":
             return np.asarray(rates)
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
@@ -180,7 +178,6 @@ class PushCell(Cell):
     def backdrop(self) -> Backdrop:
         """Rod and bar as tubes, the cube, and its goal as a ball; seen from the course's right."""
         position, rotation = self._cube()
-        vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
         points = self.simulator.state.position[0]
         neck = Tube(points, self._own.robots[0].segments[0].body_radius or self.course.thickness, _ROD)
         bar = Tube(_bar_nodes(self.course, self.simulator.state)[0], self.course.thickness, _BAR)
@@ -188,15 +185,17 @@ class PushCell(Cell):
         eye, target = self._view()
         return Backdrop(
             tubes=(neck, bar),
-            solids=(Solid(vertices, faces, _CUBE),),
+            solids=(solid_box(position, [0.5 * self.course.size] * 3, _CUBE, rotation),),
             balls=(Ball(goal, 0.012, _GOAL),),
             eye=eye,
             target=target,
         )
 
     def picture(self, width: int, height: int) -> np.ndarray:
-        """(height, width, 3) uint8, from the course's right, of a second world that is made for pictures when
-        the first is asked for."""
+        """(height, width, 3) uint8, from the course's right: of a second world that is made for pictures when
+        the first is asked for, or of the backdrop."""
+        if self._picture_world is None:
+            return super().picture(width, height)
         course = self.course
         if self._studio is None:
             self._studio = self._picture_world()
@@ -327,6 +326,8 @@ class PushTask(HostedTask):
     n_draws: ClassVar[int] = 5
     accuracy: float = ACCURACY
     duration: ClassVar[float] = 4.0
+    picture_world: Callable[[], Bullet] | None = None
+    """As in `PushCell`."""
 
     def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:
         self.course = course
@@ -370,10 +371,6 @@ class PushTask(HostedTask):
             Field("touched", "", (0.0,), (1.0,), "the robot has touched the cube in this episode"),
         )
         super().__init__(n_envs, options, course.robot, actions, states, (goal,))
-
-    @abstractmethod
-    def picture_world(self) -> Bullet:
-        """A world for pictures, without robot and cube."""
 
     def cell(self) -> Cell:
         """A `PushCell` with this course, these options, and the robot as it is before it is randomised."""

@@ -1,4 +1,4 @@
-"""`Renderer`: pictures of a task, by its host or drawn from its `Scenery`, or a page of viser."""
+"""`Renderer`: pictures of a task, by its host or drawn from its `Backdrop`, or a page of viser."""
 
 from __future__ import annotations
 

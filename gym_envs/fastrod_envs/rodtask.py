@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
+from fastrod.control import scaled_rates
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
@@ -178,7 +179,7 @@ class RodTask(Task):
         if jacobian is None:
             jacobian = self.by_driven(self.model().jacobian()[:, :3])
         scale = self._rate * np.asarray(weight)
-        q = scale * resolved(np.nan_to_num(jacobian) * scale, velocity, -self.posture())
+        q = scale * scaled_rates(np.nan_to_num(jacobian) * scale, velocity, -self.posture())
         if self.options.action == "rate":
             return np.asarray(q / self._rate)
         there = self.displacement + self.dt * q
@@ -240,15 +241,3 @@ class RodTask(Task):
         self.tip = np.where(good[:, None], tip, self.tip)
         self.direction = np.where(good[:, None], direction, self.direction)
         self.lost = np.where(some, ~(ok & sane), self.lost)
-
-
-def resolved(jacobian: Floats, velocity: Floats, wish: Floats) -> Floats:
-    """(n, n_q) rates within -1 and 1 that give the velocities (n, m): damped pseudo-inverse of `jacobian` (n,
-    m, n_q), and in its null space slowly toward `wish` (n, n_q)."""
-    transposed = np.swapaxes(jacobian, 1, 2)
-    square = jacobian @ transposed
-    damping = 1e-3 * np.trace(square, axis1=1, axis2=2) + 1e-12
-    inverse = transposed @ np.linalg.inv(square + damping[:, None, None] * np.eye(jacobian.shape[1]))
-    free = 0.2 * (wish - (inverse @ (jacobian @ wish[:, :, None]))[:, :, 0])
-    rates = (inverse @ velocity[:, :, None])[:, :, 0] + free
-    return np.asarray(rates / np.maximum(np.abs(rates).max(1, keepdims=True), 1.0))

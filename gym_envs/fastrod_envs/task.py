@@ -7,10 +7,20 @@ from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import EnvOptions, checked_difficulty
+
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+_FACES = np.vstack(
+    [
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]],
+        [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]],
+    ]
+)
+_UPRIGHT = np.eye(3)
 
 
 class Field(NamedTuple):
@@ -212,3 +222,17 @@ def length(vectors: Floats) -> Floats:
 def shortened(vectors: Floats, longest: float) -> Floats:
     """Vectors (n, 3) of at most this length, their direction kept."""
     return np.asarray(vectors * (longest / np.maximum(length(vectors), longest))[:, None])
+
+
+def solid_box(
+    middle: ArrayLike,
+    half: ArrayLike,
+    color: tuple[float, float, float],
+    rotation: Floats = _UPRIGHT,
+    opacity: float = 1.0,
+) -> Solid:
+    """A box to draw: its `middle` (3,) world [m], `half` of its edges (3,) [m], `rotation` (3, 3)
+    world_from_box."""
+    return Solid(
+        np.asarray(middle, float) + (_CORNERS * np.asarray(half, float)) @ rotation.T, _FACES, color, opacity
+    )

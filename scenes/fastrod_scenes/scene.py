@@ -101,7 +101,7 @@ class RodScene(Scene):
 
 
 class SoftBody(NamedTuple):
-    """A soft robot of a PyBullet world as it is now."""
+    """A soft robot of a stage as it is now."""
 
     robot: Robot
     state: State
@@ -110,20 +110,19 @@ class SoftBody(NamedTuple):
     """Numbers of the bodies that stand for it in the world: a drawing of the rod leaves them out."""
 
 
-class HostedWorld(ABC):
-    """A PyBullet world of its own with soft robots in it, as a scene has set it up."""
-
-    world: Bullet
-
-    @property
-    @abstractmethod
-    def state(self) -> State:
-        """Of the first soft robot, after a step."""
+class Stage(ABC):
+    """A world of its own with soft robots in it, as a scene has set it up."""
 
     @property
     @abstractmethod
     def soft_bodies(self) -> tuple[SoftBody, ...]:
         """All soft robots, after a step."""
+
+    @property
+    @final
+    def state(self) -> State:
+        """Of the first soft robot, after a step."""
+        return self.soft_bodies[0].state
 
     @abstractmethod
     def advance(self, t: float) -> None:
@@ -133,9 +132,20 @@ class HostedWorld(ABC):
         """Return the present picture of the camera on the first soft robot, where there is one."""
         return None
 
+    def close(self) -> None:  # noqa: B027
+        """Let go of what is outside of Python's memory; once more does nothing."""
+
+
+class HostedWorld(Stage):
+    """A PyBullet world."""
+
+    world: Bullet
+
+    @final
     def close(self) -> None:
-        """Disconnect the world."""
-        self.world.disconnect()
+        """Disconnect the world; once more does nothing."""
+        if self.world.isConnected():
+            self.world.disconnect()
 
 
 class SceneStage(HostedWorld):
@@ -144,14 +154,6 @@ class SceneStage(HostedWorld):
     rods: tuple[MountedRod, ...]
     arm: BulletArm | None = None
     """The serial arm that carries the first rod, where there is one."""
-
-    @property
-    @final
-    def state(self) -> State:
-        """Of the first rod."""
-        state = self.rods[0].state
-        assert state is not None
-        return state
 
     @property
     @final
@@ -168,11 +170,25 @@ class SceneStage(HostedWorld):
         that drives the arm calls it after each step of the world."""
 
 
-class HostedScene(Scene):
-    """Soft robots on the rigid robots of a PyBullet world (`pip install fastrod[hosts]`)."""
+class MujocoStage(Stage):
+    """A MuJoCo model with a rod on one of its bodies."""
+
+    model: Any
+    data: Any
+    rod: MujocoRod
+
+    @property
+    @final
+    def soft_bodies(self) -> tuple[SoftBody, ...]:
+        """The rod."""
+        return (SoftBody(self.rod.rod.robot, self.rod.rod.state, tuple(self.rod.capsule_bodies)),)
+
+
+class StagedScene(Scene):
+    """Soft robots on rigid robots, in a world that a physics engine simulates."""
 
     @abstractmethod
-    def stage(self) -> HostedWorld:
+    def stage(self) -> Stage:
         """A new world, before its first step."""
 
     @final
@@ -183,7 +199,7 @@ class HostedScene(Scene):
             yield t, stage.state
 
     @final
-    def play(self, stage: HostedWorld) -> Iterator[float]:
+    def play(self, stage: Stage) -> Iterator[float]:
         """Advance to the end of the run, t [s] by t; the world is closed afterwards, whatever happens."""
         try:
             for k in range(round(self.duration / self.dt)):
@@ -193,38 +209,20 @@ class HostedScene(Scene):
             stage.close()
 
 
-class MujocoStage(ABC):
-    """A MuJoCo model with a rod on one of its bodies, as a scene has set it up."""
-
-    model: Any
-    data: Any
-    rod: MujocoRod
+class HostedScene(StagedScene):
+    """Soft robots on the rigid robots of a PyBullet world (`pip install fastrod[hosts]`)."""
 
     @abstractmethod
-    def advance(self, t: float) -> None:
-        """Command and simulate the step that begins at time t [s]."""
+    def stage(self) -> HostedWorld:
+        """A new world, before its first step."""
 
 
-class MujocoScene(Scene):
+class MujocoScene(StagedScene):
     """A rod on a rigid robot of a MuJoCo model (`pip install fastrod[mujoco]`)."""
 
     @abstractmethod
     def stage(self) -> MujocoStage:
         """A new model and its data, before their first step."""
-
-    @final
-    def run(self) -> Iterator[tuple[float, State]]:
-        """(t [s], state of the rod) of each step."""
-        stage = self.stage()
-        for t in self.play(stage):
-            yield t, stage.rod.rod.state
-
-    @final
-    def play(self, stage: MujocoStage) -> Iterator[float]:
-        """Advance to the end of the run, t [s] by t."""
-        for k in range(round(self.duration / self.dt)):
-            stage.advance(k * self.dt)
-            yield (k + 1) * self.dt
 
 
 def names() -> tuple[str, ...]:

@@ -155,6 +155,25 @@ def test_more_coordinates_than_tasks_or_fewer() -> None:
     assert (np.abs(ResolvedRate(rate=0.01).rates(q, J, np.zeros(6), task, 0.01)) <= 0.01).all()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_constant_damping_is_damped_least_squares_and_nearest_keeps_to_it_within_limits(seed: int) -> None:
+    q, J, task = case(seed)
+    weight = np.random.default_rng(seed).uniform(0.1, 10.0, 12)
+    W, small = np.diag(1.0 / weight), 1e-3 * J  # all of it within the damping
+    damped = W @ small.T @ np.linalg.solve(small @ W @ small.T + 0.02**2 * np.eye(3), task)
+    for given in ({"threshold": np.inf}, {"nearest": True}):
+        control = ResolvedRate(damping=0.02, weight=weight, **given)  # type: ignore[arg-type]
+        assert_allclose(control.rates(q, small, ZERO, task, 0.01), damped, rtol=1e-10)
+    most = 0.5 * np.abs(damped).max()
+    rates = ResolvedRate(damping=0.02, weight=weight, nearest=True, rate=most).rates(
+        q, small, ZERO, task, 0.01
+    )
+    others = np.clip(rates + np.random.default_rng(seed).normal(0.0, 0.1 * most, (200, 12)), -most, most)
+    cost = [((small @ r - task) ** 2).sum() + 0.02**2 * (weight @ r**2) for r in (rates, *others)]
+    assert np.abs(rates).max() <= most
+    assert min(cost) == cost[0]
+
+
 def ask(**changed: Any) -> Callable[[], Any]:
     good = {"q": np.zeros(4), "jacobian": np.ones((3, 4)), "error": ZERO, "feedforward": ZERO, "dt": 0.01}
     return lambda: ResolvedRate(lower=[-1.0] * 4).rates(**(good | changed))
@@ -177,8 +196,9 @@ REFUSED = {
     "q has 5 coordinates; this ResolvedRate is made for 4.": ask(q=np.zeros(5), jacobian=np.ones((3, 5))),
     "dt is 0.0 s; it must be a number, positive and finite.": ask(dt=0.0),
     "ResolvedRate.gain is -1.0 1/s; it must be a finite number, zero or positive.": made(gain=-1.0),
-    "ResolvedRate.error_limit is 0.0 m; it must be a number, positive and finite, or None.": made(
-        error_limit=0.0
+    "ResolvedRate.error_limit is 0.0 m; it must be a positive number, or None.": made(error_limit=0.0),
+    "ResolvedRate has a posture, for which nearest leaves no room; give one.": made(
+        nearest=True, posture=[0.0]
     ),
     "ResolvedRate.rate is [1.0, 0.0]; every number of it must be positive.": made(rate=[1.0, 0.0]),
     "ResolvedRate.weight is [1.0, inf]; every number of it must be finite.": made(weight=[1.0, np.inf]),

@@ -31,8 +31,8 @@ from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
+from fastrod_device.readings import Trace
 from fastrod_device.safety import SafetyState
-from fastrod_device.trace import Trace
 from fastrod_device.workbench import emulated
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")

@@ -16,14 +16,14 @@ from subprocess import PIPE, Popen
 
 import pytest
 
-from fastrod.access import is_loopback
+from fastrod.access import free_port, is_loopback
 from fastrod.commands.cli import main
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robotfile import load_robot
 from fastrod_viewer.app import DEMO_LOG, App, found, view
 from fastrod_viewer.playback import Playback
-from fastrod_viewer.server import free_port, serve
+from fastrod_viewer.server import serve
 from fastrod_viewer.worlds import FreeWorld, SceneWorld
 
 

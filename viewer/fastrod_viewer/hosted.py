@@ -1,5 +1,5 @@
-"""`HostedView`: a scene in a PyBullet world, played or driven by hand: its soft robots, the arm that carries
-them, and its other bodies."""
+"""`StagedView`: a scene in the world of a physics engine, played; `HostedView`: one in PyBullet, also driven
+by hand: its soft robots, the arm that carries them, and its other bodies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fastrod.hosts import BulletArm, MountedRod, Visuals
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
-from fastrod_scenes.scene import HostedScene, HostedWorld, SceneStage, SoftBody
+from fastrod_scenes.scene import HostedScene, HostedWorld, SceneStage, SoftBody, Stage, StagedScene
 from fastrod_viewer.robots import Loads, actions_of, moved, radii, tendon_inputs
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
 
@@ -24,52 +24,103 @@ arm."""
 _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 
-@final
-class HostedView(World):
-    """One scene. Manual commands drive the first soft robot and the arm that carries it; other soft robots
-    keep their last inputs.
-
-    After a manual command, the script begins anew with the next `play`. Worlds whose soft robot is no
-    `MountedRod` only play.
-    """
+class StagedView(World):
+    """One scene, played in a world of its own, again and again."""
 
     scripted = True
+    host = True
+    _stage: Stage
 
-    def __init__(self, scene: HostedScene) -> None:
-        """Raises `HostError` where PyBullet is missing."""
+    def __init__(self, scene: StagedScene) -> None:
+        """Raises `HostError` where the physics engine is missing."""
         self.scene = scene
         self.name, self.about, self.dt, self.duration = scene.name, scene.about, scene.dt, scene.duration
-        self._stage: HostedWorld = scene.stage()
-        self._kinematics: SoftTip | None = None
-        self._joints: Floats | None = None  # where manual commands drive the arm
-        self._home: Floats = np.zeros(7)  # of the flange, where ManualCommand.base is zero
-        # the last that the arm has followed; None: something else has moved it since
-        self._base: Floats | None = None
-        self._steps, self._driven, self._frozen = 0, False, False
-        self.drivable = self.loads = isinstance(self._stage, SceneStage)
-        self.host = self.base_moves = isinstance(self._stage, SceneStage) and self._stage.arm is not None
-        self._see()
+        self._set_up()
         self.robot: Robot = self._soft[0].robot
         self.actions = actions_of(self.robot)
-        self._loads = Loads(self.robot)
         self._radius = [radii(soft.robot) for soft in self._soft]
-        self._bodies = tuple(
-            Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3])
-            for shape in self._visuals.shapes
-        )
 
     @property
+    @final
     def t(self) -> float:
         """Steps since the last reset, by hand or by script, times dt [s]."""
         return self._steps * self.dt
 
     @property
+    @final
     def rods(self) -> tuple[DrawnRods, ...]:
         """The stage's soft robots, where they are in the world: none is drawn elsewhere."""
         still = np.zeros((1, 3))
         return tuple(
             DrawnRods((soft.robot,), soft.state, still, radius)
             for soft, radius in zip(self._soft, self._radius, strict=True)
+        )
+
+    @final
+    def play(self) -> None:
+        """Play one step of the script; from its end, or after a manual command, go back to its beginning.
+        Raises `HostError` where the rod is lost, after a reset."""
+        if self._driven or self._steps >= round(self.duration / self.dt):
+            self.reset()
+            return
+        try:
+            self._stage.advance(self.t)
+        except HostError:
+            self.reset()
+            raise
+        self._arrived()
+
+    @final
+    def reset(self) -> None:
+        """A new world, as the scene sets it up; the old one is closed."""
+        self.close()
+        self._set_up()
+
+    @final
+    def close(self) -> None:
+        """Let go of the world; once more does nothing."""
+        self._stage.close()
+
+    def _set_up(self) -> None:
+        self._stage = self.scene.stage()
+        self._soft: tuple[SoftBody, ...] = self._stage.soft_bodies
+        self._steps, self._driven = 0, False
+
+    def _arrived(self) -> None:
+        self._soft = self._stage.soft_bodies
+        self._steps += 1
+
+    def _no_hand(self, what: str = "they cannot be driven by hand.") -> InputError:
+        return InputError(f"scene {self.name!r} has a script that moves its robots; {what}")
+
+
+@final
+class HostedView(StagedView):
+    """Manual commands drive the first soft robot and the arm that carries it; other soft robots keep their
+    last inputs.
+
+    After a manual command, the script begins anew with the next `play`. Worlds whose soft robot is no
+    `MountedRod` only play.
+    """
+
+    _stage: HostedWorld
+    _kinematics: SoftTip | None
+    _joints: Floats | None
+    """Where manual commands drive the arm."""
+    _base: Floats | None
+    """The last that the arm has followed; None: something else has moved it since."""
+    _frozen: bool
+
+    def __init__(self, scene: HostedScene) -> None:
+        """Raises `HostError` where PyBullet is missing."""
+        super().__init__(scene)
+        self._home: Floats = np.zeros(7)  # of the flange, where ManualCommand.base is zero
+        self.drivable = self.loads = isinstance(self._stage, SceneStage)
+        self.host = self.base_moves = isinstance(self._stage, SceneStage) and self._stage.arm is not None
+        self._loads = Loads(self.robot)
+        self._bodies = tuple(
+            Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3])
+            for shape in self._visuals.shapes
         )
 
     @property
@@ -82,27 +133,13 @@ class HostedView(World):
         """(n_bodies, 7) of their links' URDF frames, world."""
         return self._visuals.poses()
 
-    def play(self) -> None:
-        """Play one step of the script; from its end, or after a manual command, go back to its beginning."""
-        if self._driven or self._steps >= round(self.duration / self.dt):
-            self.reset()
-            return
-        try:
-            self._stage.advance(self.t)
-        except HostError:
-            self.reset()
-            raise
-        self._arrived()
-
     def drive(self, command: ManualCommand) -> None:
         """Do one step of a manual command. Where the arm cannot follow, it stays, the step is done, and
         `HostError` then says why; where the soft robot is lost the world is reset. Raises `InputError` for a
         command that no robot can follow; the world then has not moved."""
         stage = self._stage
         if not isinstance(stage, SceneStage):
-            raise InputError(
-                f"scene {self.name!r} has a script that moves its robots; they cannot be driven by hand."
-            )
+            raise self._no_hand()
         given = self._loads.added(tendon_inputs(self.robot, command), command)
         moved(np.zeros(7), command.base)  # refuses what is no motion
         refused: HostError | None = None
@@ -126,19 +163,11 @@ class HostedView(World):
         if refused is not None:
             raise refused
 
-    def reset(self) -> None:
-        """A new world, as the scene sets it up; the old one is closed."""
-        self.close()
-        self._stage = self.scene.stage()
-        self._see()
-
     def jacobian(self) -> Floats:
         """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen
         are zero. Raises `InputError` where there is none."""
         if not isinstance(self._stage, SceneStage):
-            raise InputError(
-                f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag."
-            )
+            raise self._no_hand("there is no Jacobian for a drag.")
         if self.actions is None:
             raise InputError(
                 f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip."
@@ -166,21 +195,11 @@ class HostedView(World):
         image = self._stage.picture()
         return None if image is None else image.rgb
 
-    def close(self) -> None:
-        """Disconnect the world; once more does nothing."""
-        if self._stage.world.isConnected():
-            self._stage.close()
-
-    def _see(self) -> None:
-        """A stage has been set up."""
-        self._soft: tuple[SoftBody, ...] = self._stage.soft_bodies
+    def _set_up(self) -> None:
+        super()._set_up()
         self._visuals = Visuals(self._stage.world, {body for soft in self._soft for body in soft.capsules})
         self._kinematics = self._joints = self._base = None
-        self._steps, self._driven, self._frozen = 0, False, False
-
-    def _arrived(self) -> None:
-        self._soft = self._stage.soft_bodies
-        self._steps += 1
+        self._frozen = False
 
     def _drive_arm(self, arm: BulletArm, command: ManualCommand) -> None:
         """Command the motors. Raises `HostError` where the flange cannot go there; the command before then

@@ -44,7 +44,7 @@ class Picture:
     >>> import fastrod
     >>> robot = fastrod.load_robot("prototype")
     >>> state = fastrod.Simulator(robot).settle(robot.rest_tendon_length)
-    >>> rods = Rods((robot,), state, np.zeros((1, 3)), (0.012,))
+    >>> rods = DrawnRods((robot,), state, np.zeros((1, 3)), (0.012,))
     >>> batches = Picture(rods).frame(rods)
     >>> len(batches["body"].position), batches["tip"].position.round(3)
     (40, array([[0.  , 0.  , 0.07]], dtype=float32))

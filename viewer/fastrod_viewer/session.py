@@ -18,9 +18,8 @@ from fastrod.logs.link import Measurement, RobotLink
 from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import RunLog
 from fastrod_viewer.linked import Linked
-from fastrod_viewer.measuring import measure
 from fastrod_viewer.teleop import Teleop
-from fastrod_viewer.world import ManualCommand, World
+from fastrod_viewer.world import ManualCommand, World, measure
 
 RATE = 30.0
 """Pictures a second."""

@@ -10,11 +10,11 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.control import ResolvedRate
 from fastrod.errors import FastrodError, InputError
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
-from fastrod_viewer.drag import drag_rates
 from fastrod_viewer.linked import TendonLimits
 from fastrod_viewer.world import ManualCommand, World
 
@@ -22,6 +22,17 @@ LARGEST_BEND = math.pi / 2.0
 """Of a segment toward either side [rad]."""
 LARGEST_TENSION = 20.0
 """Of a tendon that is driven by tension [N]."""
+DRAG_GAIN = 8.0
+"""1/s: the tip is where it is dragged to within an eighth of a second."""
+FARTHEST = 0.25
+"""Of the robot's length: a tip that is dragged farther counts as this far."""
+DRAG_DAMPING = 0.02
+"""Of the robot's length by 1 rad: where less than that moves the tip, the motion is given up rather than the
+segments thrown about."""
+JOINT_RATE = 0.4
+"""Largest of a host's joint in a drag [rad/s]."""
+JOINT_COST = 25.0
+"""Weight of a joint's 1 rad, where that of a segment's bend by 1 rad is 1: the soft robot goes first."""
 _INSIDE = 0.999  # of a limit: sums of floats must not be beyond it
 _NOTHING = 1e-6  # m of a tendon, below which a robot is bent by its segments alone
 
@@ -324,17 +335,35 @@ class Teleop:
             return None
         try:
             jacobian = self._world.jacobian()
+            n = jacobian.shape[1] - self.actions.n_actions
             error = self._pull - self._world.rods[0].state.tip_position[0]
-            limits = self._lower, self._upper, self._action_rates(self.actions, self._speeds)
-            rates = drag_rates(self.robot, self.actions, self._now.action, jacobian, error, limits, dt)
+            q = np.concatenate([np.zeros(n), self._now.action])
+            rates = self._drag_law(self.actions, n).rates(q, jacobian, error, np.zeros(3), dt)
         except FastrodError as error_of_world:
             self.problem = str(error_of_world)
             return None
         self.problem = ""
-        n = len(rates) - self.actions.n_actions
         action = np.clip(self._now.action + dt * rates[n:], self._lower, self._upper)
         self._goals = _with(self._goals, action=action)
         return rates[:n] if n else None
+
+    def _drag_law(self, actions: SegmentActions, n_joints: int) -> ResolvedRate:
+        """Of the host's joints and the actions. A drag may pull anywhere: a robot at its limits follows
+        partly."""
+        width = self._upper - self._lower
+        cost = np.concatenate([np.full(n_joints, JOINT_COST), 1.0 / np.repeat(actions.offset, 3) ** 2])
+        cost[n_joints::3] = 1.0 / np.maximum(width[::3], 1e-3) ** 2
+        free = np.full(n_joints, np.inf)
+        return ResolvedRate(
+            gain=DRAG_GAIN,
+            damping=DRAG_DAMPING * self.robot.length,
+            lower=np.concatenate([-free, self._lower]),
+            upper=np.concatenate([free, self._upper]),
+            rate=np.concatenate([np.full(n_joints, JOINT_RATE), self._action_rates(actions, self._speeds)]),
+            weight=cost,
+            error_limit=FARTHEST * self.robot.length,
+            nearest=True,
+        )
 
 
 def _arrays(goals: Goals) -> tuple[Floats, ...]:

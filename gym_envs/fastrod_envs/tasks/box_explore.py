@@ -16,10 +16,10 @@ from fastrod.hosts.camera import Image
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
-from fastrod_envs.arms import SoftArm, arm_tube, solid_box
+from fastrod_envs.arms import SoftArm, arm_tube
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Tube
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Tube, solid_box
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.box import COLORS, CORNERS, Box
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, soft_robot

@@ -7,18 +7,17 @@ from typing import ClassVar, final
 
 import numpy as np
 
+from fastrod.control import scaled_rates
 from fastrod.errors import HostError
-from fastrod.hosts import Bullet, HostCamera, connect
-from fastrod.hosts.bodies import RodBodies
+from fastrod.hosts import Bullet, connect
 from fastrod.hosts.gripper import Gripper
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_envs.arms import SoftArm, short, solid_box
+from fastrod_envs.arms import SoftArm, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.rodtask import resolved
-from fastrod_envs.task import Backdrop, Ball, Field, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
 HEIGHT = 0.3
@@ -48,6 +47,7 @@ _HOLD = _HEAD + BALL  # m, from a tip to the middle of a ball that it touches
 _FALLEN = 0.15  # m, below the bases
 _SUBSTEP, _DT = 0.05, 0.01  # s, longest step of the soft robots, of the world
 _MASS = 0.005  # kg
+_MOUNT = 0.5 * HEIGHT + 0.01  # m, half the height of what a robot stands out from
 _POINTS = 5
 _SIDES = (-1.0, 1.0)
 _COLORS = ((0.5, 0.0, 0.6), (0.0, 0.45, 0.5))
@@ -146,7 +146,7 @@ def tips_range() -> tuple[Floats, Floats]:
 
 
 class _Pair(Cell):
-    """Two worlds: one of heads and ball, made anew for every episode, and one that is only looked at."""
+    """A world of heads and ball, made anew for every episode."""
 
     def __init__(self, task: DualArm) -> None:
         self.at_once, self.accuracy = task.options.action == "displacement", task.accuracy
@@ -154,7 +154,7 @@ class _Pair(Cell):
         self.n_steps = max(1, math.ceil(task.dt / self.n_substeps / _DT - 1e-9))
         self.step = task.dt / (self.n_substeps * self.n_steps)
         self.low, self.high = tips_range()
-        self.world, self.shown = connect(dt=self.step), connect()
+        self.world = connect(dt=self.step)
         robot = task.base_robot
         self.softs = [
             SoftArm(
@@ -171,18 +171,6 @@ class _Pair(Cell):
             np.array([side * BASE, 0.0, HEIGHT, *facing])
             for side, facing in zip(_SIDES, _FACING, strict=True)
         ]
-        self.bodies = [
-            RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*color, 1.0)) for color in _COLORS
-        ]
-        self.shown_ball, self.shown_heads = _furnish(self.shown)
-        b = self.shown
-        mark = b.createVisualShape(b.GEOM_SPHERE, radius=0.006, rgbaColor=[*_GREEN, 1.0])
-        self.mark: int = b.createMultiBody(0.0, -1, mark)
-        mount = b.createVisualShape(
-            b.GEOM_BOX, halfExtents=[0.02, 0.04, 0.5 * HEIGHT + 0.02], rgbaColor=[*_GREY, 1.0]
-        )
-        for side in _SIDES:
-            b.createMultiBody(0.0, -1, mount, [side * (BASE + 0.02), 0.0, 0.5 * HEIGHT])
 
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
         self.goal_at = np.array(GOAL) + difficulty * (2.0 * draws[:3] - 1.0) * SPREAD
@@ -223,7 +211,7 @@ class _Pair(Cell):
                     to = 0.5 * (self.low[k] + self.high[k]) + 0.5 * (self.high[k] - self.low[k]) * moves[k]
                     velocity = np.clip((to - soft.tip) / substep, -SPEED, SPEED)
                 jacobian = soft.jacobian()[:3] * soft.rate
-                rates = resolved(jacobian[None], velocity[None], -soft.posture()[None])[0]
+                rates = scaled_rates(jacobian[None], velocity[None], -soft.posture()[None])[0]
                 soft.drive(soft.action + substep * soft.rate * rates)
             self._advance(substep)
             self._look()
@@ -312,27 +300,14 @@ class _Pair(Cell):
                 *(Ball(soft.tip, _HEAD, (0.0, 0.0, 0.75)) for soft in self.softs),
             ),
             solids=tuple(
-                solid_box([side * (BASE + 0.02), 0.0, 0.5 * HEIGHT], [0.02, 0.04, 0.5 * HEIGHT + 0.02], _GREY)
-                for side in _SIDES
+                solid_box([side * (BASE + 0.02), 0.0, _MOUNT], [0.02, 0.04, _MOUNT], _GREY) for side in _SIDES
             ),
             eye=(0.1, -0.75, 0.5),
             target=(0.0, 0.0, 0.28),
         )
 
-    def picture(self, width: int, height: int) -> np.ndarray:
-        b = self.shown
-        for soft, bodies, head in zip(self.softs, self.bodies, self.shown_heads, strict=True):
-            bodies.place(soft.nodes, soft.rotations)
-            head.place(soft.tip, quaternion_from_matrix(soft.tip_rotation))
-        for body, place in ((self.shown_ball, self.place), (self.mark, self.goal_at)):
-            b.resetBasePositionAndOrientation(body, place.tolist(), [0.0, 0.0, 0.0, 1.0])
-        return (
-            HostCamera(width=width, height=height, fov=40.0).look(b, (0.1, -0.75, 0.5), (0.0, 0.0, 0.28)).rgb
-        )
-
     def close(self) -> None:
         self.world.disconnect()
-        self.shown.disconnect()
 
     def _advance(self, duration: float) -> None:
         """The world's steps while the heads move to where the soft robots now have them."""

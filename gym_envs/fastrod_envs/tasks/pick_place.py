@@ -9,6 +9,7 @@ from typing import ClassVar, Literal, final, get_args
 
 import numpy as np
 
+from fastrod.control import ResolvedRate
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
@@ -18,10 +19,10 @@ from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_envs.arms import SoftArm, arm_tube, short, solid_box
+from fastrod_envs.arms import SoftArm, arm_tube, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.task import Backdrop, Ball, Field, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.carried import RADIUS, Bracket, soft_robot
 from fastrod_scenes.ur5.picking import ADAPTER, SIDE, TOP, WIDTH
@@ -192,6 +193,14 @@ class _Table(Cell):
             largest_bend=0.5 * BEND,
             bend_rate=BEND_RATE,
             extension_rate=0.01,
+        )
+        self._joints = ResolvedRate(
+            gain=1.0 / self.soft.dt,
+            damping=1e-3,
+            threshold=math.inf,
+            lower=self.arm.lower,
+            upper=self.arm.upper,
+            rate=self.arm.velocity_limit,
         )
         self.bodies = RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*_BODY, 1.0))
         self.shown_cube, self.shown_spot, self.shown_gripper = _furnish(self.shown, self.width)
@@ -370,10 +379,8 @@ class _Table(Cell):
         error = np.concatenate(
             [self.flange[:3] - now[:3], rotation_between(now[None, 3:], self.flange[None, 3:])[0]]
         )
-        jacobian = self.arm.jacobian(self.q)
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(6), error)
-        most = self.arm.velocity_limit * self.soft.dt
-        self.q = np.clip(self.q + np.clip(step, -most, most), self.arm.lower, self.arm.upper)
+        rates = self._joints.rates(self.q, self.arm.jacobian(self.q), error, np.zeros(6), self.soft.dt)
+        self.q = self.q + self.soft.dt * rates
 
     def _base(self) -> Floats:
         """(7,) of the soft robot, on the flange."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import final
 
-from fastrod.hosts.bullet import Bullet, connect
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, longer
 from fastrod_envs.pushing import PushTask
-from fastrod_scenes.a1.quadruped import floor, neck
+from fastrod_scenes.a1.quadruped import neck
 
 HEIGHT = 0.5
 """From which the robot hangs [m]."""
@@ -51,12 +50,3 @@ class Push(PushTask):
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
-
-    def picture_world(self) -> Bullet:
-        world = connect()
-        floor(world)
-        plate = world.createVisualShape(
-            world.GEOM_BOX, halfExtents=[0.06, 0.06, 0.01], rgbaColor=[0.5, 0.5, 0.5, 1.0]
-        )
-        world.createMultiBody(0.0, -1, plate, [0.0, 0.0, HEIGHT + 0.01])
-        return world

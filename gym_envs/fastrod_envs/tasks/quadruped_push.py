@@ -64,5 +64,6 @@ class QuadrupedPush(PushTask):
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
-    def picture_world(self) -> Bullet:
+    @staticmethod
+    def picture_world() -> Bullet:
         return standing(0.005, PITCH)[0]

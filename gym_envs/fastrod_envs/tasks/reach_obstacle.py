@@ -9,8 +9,7 @@ import numpy as np
 from fastrod.contact import ContactScene, box
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.shapes import box_mesh
-from fastrod_envs.task import Backdrop, Ball, Field, Outcome, Solid, length
+from fastrod_envs.task import Backdrop, Ball, Field, Outcome, length, solid_box
 from fastrod_envs.tasks.reach import ReachTask, drives, hanging_robot
 
 BAR, SIZE = (0.0, 0.06, 0.35), (0.4, 0.02, 0.02)
@@ -97,7 +96,7 @@ class ReachObstacle(ReachTask):
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt), weight=weight)
 
     def backdrop(self, i: int) -> Backdrop:
-        bar = Solid(*box_mesh(SIZE, BAR), (0.55, 0.57, 0.6))
+        bar = solid_box(BAR, 0.5 * np.array(SIZE), (0.55, 0.57, 0.6))
         return Backdrop(
             tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),), solids=(bar,)
         )

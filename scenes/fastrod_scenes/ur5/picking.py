@@ -15,7 +15,6 @@ from fastrod.hosts.paper import paper_robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
 from fastrod.simulator import Simulator
-from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.scene import HostedWorld, SoftBody
@@ -150,23 +149,18 @@ class Picking(HostedWorld):
         self._follow()
 
     @property
-    def state(self) -> State:
-        """Of the soft robot, settled where its base is."""
-        pose = self._place.copy()
+    def soft_bodies(self) -> tuple[SoftBody, ...]:
+        """The one, settled where its base is; its gripper is none of its capsules."""
+        pose, b = self._place.copy(), self.world
         # fastrod's frame of the base: d3 along the robot's +y
         pose[3:] = product(pose[3:], _MOUNT * [1.0, -1.0, -1.0, -1.0])
-        return self._model.settle(**self._actions.inputs(self._action(self._bend)), base_pose=pose)
-
-    @property
-    def soft_bodies(self) -> tuple[SoftBody, ...]:
-        """The one; its gripper is none of its capsules."""
-        b = self.world
+        state = self._model.settle(**self._actions.inputs(self._action(self._bend)), base_pose=pose)
         capsules = (
             i
             for i in self.soft
             if any(shape[2] == b.GEOM_CAPSULE for shape in b.getCollisionShapeData(i, -1))
         )
-        return (SoftBody(self._model.robots[0], self.state, tuple(capsules)),)
+        return (SoftBody(self._model.robots[0], state, tuple(capsules)),)
 
     @property
     def tip(self) -> tuple[Floats, Floats]:
