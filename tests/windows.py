@@ -32,8 +32,12 @@ class Window:
     """A browser window of its own, with what it asked for."""
 
     def __init__(self, browser: Any, width: int = 1280, height: int = 800, offline: bool = False) -> None:
+        # half the resolution: without a graphics card the pixels are what a frame costs
         self.context = browser.new_context(
-            viewport={"width": width, "height": height}, offline=offline, accept_downloads=True
+            viewport={"width": width, "height": height},
+            device_scale_factor=0.5,
+            offline=offline,
+            accept_downloads=True,
         )
         self.page = self.context.new_page()
         self.page.set_default_timeout(1e3 * PATIENCE)
@@ -119,7 +123,7 @@ class Window:
         """(height, width, 3) what is seen of the canvas and all over it."""
         from matplotlib.image import imread
 
-        picture = imread(io.BytesIO(self.page.screenshot()), format="png")[..., :3]
+        picture = imread(io.BytesIO(self.page.screenshot(scale="css")), format="png")[..., :3]
         return np.asarray(255.0 * picture, dtype=np.uint8)
 
     def close(self) -> None:

@@ -390,7 +390,7 @@ class Supervisor:
             raise RefusedError(f"tendon {k + 1} was commanded {wanted[k]} m; it must be a finite number.")
         k = int(np.argmax(np.abs(wanted)))
         if abs(wanted[k]) > self.limits.displacement:
-            given, limit = 1e3 * wanted[k], 1e3 * self.limits.displacement
+            given, limit = 1e3 * float(wanted[k]), 1e3 * self.limits.displacement
             raise RefusedError(
                 f"tendon {k + 1} was commanded {given:.6g} mm; this robot's limit is {limit:.6g} mm."
             )

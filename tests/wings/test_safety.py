@@ -265,6 +265,7 @@ def test_what_is_off_is_looked_at_and_not_stopped():
     ("dl", "words"),
     [
         ([0.001, -0.0091, 0.0, 0.0], "tendon 2 was commanded -9.1 mm; this robot's limit is 8 mm."),
+        ([0.0, 0.0, 0.0, 1.8e305], "tendon 4 was commanded inf mm; this robot's limit is 8 mm."),
         ([0.0, 0.0, NAN, 0.0], "tendon 3 was commanded nan"),
         ([0.0, 0.0, 0.0, INF], "tendon 4 was commanded inf"),
         ([0.0, 0.0, 0.0], r"shape \(3,\)"),
