@@ -10,7 +10,8 @@ from typing import Any
 from numba.core import event
 
 _register: Any = event.register  # it has no types
-_LONG = ("fastrod.kernels.", "fastrod.solver.")  # a shape of contact is compiled in a second
+_LONG = ("fastrod.kernels.", "fastrod.solver.")
+_SHORT = "fastrod.kernels.vec"  # of a kernel, or of a shape of contact, which is compiled in a second
 _CONTACT = ("iterate_serial", "iterate_parallel", "search_serial", "search_parallel")
 
 
@@ -25,7 +26,8 @@ class _Notice(event.Listener):
     def on_start(self, what: Any) -> None:
         """Print, unless `FASTROD_QUIET` is set or this line was printed before."""
         function = what.data["dispatcher"].py_func
-        if os.environ.get("FASTROD_QUIET") or not function.__module__.startswith(_LONG):
+        module = function.__module__
+        if os.environ.get("FASTROD_QUIET") or not module.startswith(_LONG) or module == _SHORT:
             return
         contact = function.__name__ in _CONTACT
         work = "Compiling contact kernels, about two minutes" if contact else "Compiling kernels, about 30 s"

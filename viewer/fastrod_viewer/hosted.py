@@ -90,7 +90,7 @@ class StagedView(World):
         self._soft = self._stage.soft_bodies
         self._steps += 1
 
-    def _no_hand(self, what: str = "they cannot be driven by hand.") -> InputError:
+    def _not_driven(self, what: str = "they cannot be driven by hand.") -> InputError:
         return InputError(f"scene {self.name!r} has a script that moves its robots; {what}")
 
 
@@ -139,7 +139,7 @@ class HostedView(StagedView):
         command that no robot can follow; the world then has not moved."""
         stage = self._stage
         if not isinstance(stage, SceneStage):
-            raise self._no_hand()
+            raise self._not_driven()
         given = self._loads.added(tendon_inputs(self.robot, command), command)
         moved(np.zeros(7), command.base)  # refuses what is no motion
         refused: HostError | None = None
@@ -167,7 +167,7 @@ class HostedView(StagedView):
         """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen
         are zero. Raises `InputError` where there is none."""
         if not isinstance(self._stage, SceneStage):
-            raise self._no_hand("there is no Jacobian for a drag.")
+            raise self._not_driven("there is no Jacobian for a drag.")
         if self.actions is None:
             raise InputError(
                 f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip."

@@ -45,11 +45,11 @@ class MujocoView(StagedView):
 
     def drive(self, command: ManualCommand) -> NoReturn:  # noqa: ARG002
         """Raises `InputError`: only the script moves this world."""
-        raise self._no_hand()
+        raise self._not_driven()
 
     def jacobian(self) -> NoReturn:
         """Raises `InputError`: only the script moves this world."""
-        raise self._no_hand()
+        raise self._not_driven()
 
 
 def _body(model: Any, geom: int) -> Body:
