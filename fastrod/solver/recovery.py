@@ -116,7 +116,7 @@ def _largest_load(params: Params, ports: Ports) -> float:
 def _largest(a: Floats) -> float:
     """|a|, of one robot in a third of numpy's time."""
     if a.size <= 16:
-        return max(map(abs, a.ravel().tolist()), default=0.0)
+        return float(max(map(abs, a.ravel().tolist()), default=0.0))
     return float(np.abs(a).max())
 
 
