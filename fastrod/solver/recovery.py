@@ -110,7 +110,7 @@ def _largest_load(params: Params, ports: Ports) -> float:
     force = _largest(ports.tip_force) + _largest(ports.tip_moment) / shortest + _largest(ports.follower_force)
     force += _largest(ports.line_force) * (length + segments * _largest(ports.extension))
     force += _largest(ports.node_force) * ports.node_force.shape[1]
-    return math.sqrt(3.0) * force * length / float(params.moment_scale.min())
+    return float(math.sqrt(3.0) * force * length / params.moment_scale.min())
 
 
 def _largest(a: Floats) -> float:
