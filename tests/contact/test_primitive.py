@@ -122,7 +122,7 @@ def test_a_rod_on_an_ellipsoid_rests_as_on_its_fine_mesh():
     ball = trimesh.creation.icosphere(subdivisions=6, radius=1.0)
     solid = mesh((ball.vertices * radii, ball.faces), **place)
     smooth, faceted = settled(ellipsoid(radii, **place)), settled(solid)
-    # facets of 0.2 mm lie up to 1e-6 m below what they stand for; nodes stand under the contacts, which differ
+    # facets of 0.2 mm lie up to 1e-6 m below what they stand for; nodes stand under contacts, which differ
     assert_allclose(smooth.tip_position, faceted.tip_position, rtol=0, atol=3e-6)
     forces = [np.nansum(s.contacts.force[0], axis=0) for s in (smooth, faceted)]
     assert np.linalg.norm(forces[0]) > 0.1
