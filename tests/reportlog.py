@@ -1,4 +1,4 @@
-"""A small log of a robot whose wires have play: 28 s in three runs, seconds to identify."""
+"""A small log of a robot whose tendons have play: 28 s in three runs, seconds to identify."""
 
 from __future__ import annotations
 

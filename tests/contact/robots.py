@@ -11,7 +11,7 @@ OFFSET, LENGTH = 0.0075, 0.07
 
 
 def prototype(compliance: float = 1e-7) -> Robot:
-    """The paper's robot; wires that hardly stretch hold the mean curvature that they are given."""
+    """The paper's robot; tendons that hardly stretch hold the mean curvature that they are given."""
     routed = tuple(Tendon(offset=OFFSET, angle=0.5 * np.pi * i, compliance=compliance) for i in range(4))
     rod = Segment(
         length=LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, tendons=routed
@@ -28,7 +28,7 @@ def bent(x: float | Floats, y: float | Floats = 0.0) -> Floats:
 
 
 def passive(length: float = 0.3, stiffness: float = 0.02, weight: float = 0.3) -> Robot:
-    """A rod without wires; `weight` [kg/m]."""
+    """A rod without tendons; `weight` [kg/m]."""
     rod = Segment(
         length=length,
         bending_stiffness=(stiffness, stiffness),

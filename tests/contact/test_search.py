@@ -36,7 +36,7 @@ def _search(curve, options, surfaces, frames, distance, position, work, found):
 def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
     """Several balls of one mesh beside three nodes that are 30 mm apart: every ball that the rod enters has a
     candidate, and the smallest gap is the sampled one."""
-    rng, dense = np.random.default_rng(11), np.linspace(0.0, 0.06, 6001)
+    rng, dense = np.random.default_rng(11), np.linspace(0.0, 0.06, 24001)
     line = np.stack([0.0 * dense, 0.0 * dense, dense], axis=1)
     s = np.array([0.0, 0.03, 0.06])
     curve = Curve(np.stack([0.0 * s, 0.0 * s, s], axis=1), np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)), s)

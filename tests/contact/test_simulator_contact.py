@@ -36,7 +36,7 @@ def bar(friction: float = 0.0, **options) -> ContactScene:
     )
 
 
-# tip force [N] and tip z [m] of a rod whose wires do not stretch
+# tip force [N] and tip z [m] of a rod whose tendons do not stretch
 @pytest.mark.parametrize(
     ("curvature", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
 )
@@ -331,7 +331,7 @@ def test_compliance_and_jacobian_hold_the_contact_forces():
     free = fastrod.Simulator(prototype(1e-5))
     loads = list(zip(state.contacts.arclength[0], state.contacts.force[0], strict=True))
     free.settle(bent(12.0, 1.0), point_force=loads)
-    # lengths closed to 1e-9 m leave 1e-4 N open in wires of 1e-5 m/N, of some newtons
+    # lengths closed to 1e-9 m leave 1e-4 N open in tendons of 1e-5 m/N, of some newtons
     assert_allclose(sim.jacobian()[:, :, :4], free.jacobian()[:, :, :4], rtol=1e-4, atol=1e-6)
     assert_allclose(sim.compliance(), free.compliance(), rtol=1e-4, atol=1e-6)
 

@@ -21,7 +21,7 @@ def one_segment(line_density: float = 0.0, **changes: Any) -> Robot:
 
 
 def two_segments(line_density: float = 0.0, **changes: Any) -> Robot:
-    """Antagonistic wires, those of the far segment at places of their own in the near one."""
+    """Antagonistic tendons, those of the far segment at places of their own in the near one."""
     (near,) = one_segment(line_density).segments
     routed = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
     far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=routed)

@@ -66,7 +66,7 @@ def times(n: int = N) -> np.ndarray:
 
 
 def log(robot: Robot, n: int = N) -> RunLog:
-    """Every kind of input: wires, extensions, loads, another base half way."""
+    """Every kind of input: tendons, extensions, loads, another base half way."""
     turned = Rotation.from_rotvec(np.where(np.arange(n)[:, None] < n // 2, 0.0, [0.9, -0.5, 0.3]))
     return log_of(
         robot,

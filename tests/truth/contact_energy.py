@@ -120,7 +120,7 @@ class _Look(NamedTuple):
 
     rod: Rod
     chain: Chain
-    slot: NDArray[np.intp]  # (c,) that keeps a constraint's name while nodes come and go
+    key: NDArray[np.intp]  # (c,) that keeps a constraint's name while nodes come and go
     node: NDArray[np.intp]  # (c,)
     gap: Floats  # (c,)
     normal: Floats  # (c, 3)
@@ -228,7 +228,7 @@ def patches(found: Minimum, least: float = 1e-6) -> list[Patch]:
 def _bottom(
     rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, force: Floats, slack: float, planar: bool
 ) -> tuple[Floats, Floats, _State]:
-    """Curvatures (3 e,), multipliers by slot and how good they are, at the nearest bottom."""
+    """Curvatures (3 e,), multipliers by key and how good they are, at the nearest bottom."""
     reach = 0.05 * float(rod.step.sum())  # m that a node may move in one step: a wall is not to be jumped
     scale = (rod.step[:, None] * rod.stiffness).ravel()
     root = np.sqrt(scale)
@@ -240,7 +240,7 @@ def _bottom(
         there = jacobian[look.node]
         rows = np.einsum("cx,cxd->cd", look.normal, there)
         slope = slope_of(look.rod, u, look.chain)
-        now = force[look.slot]
+        now = force[look.key]
         violation = float(np.maximum(-look.gap, 0.0).max(initial=0.0))
         stationarity = float(np.abs((slope - now @ rows) / np.repeat(rod.step, 3)).max())
         idle = float(np.abs(now * look.gap).max(initial=0.0))  # N m of force where there is no contact
@@ -262,7 +262,7 @@ def _bottom(
         part = min(1.0, reach / farthest) if farthest > 0.0 else 1.0
         x, part = _search(rod, obstacles, x, move, part, 2.0 * max(float(wanted.max(initial=0.0)), 1e-3))
         new = np.zeros_like(force)
-        new[look.slot[near]] = wanted
+        new[look.key[near]] = wanted
         force = (1.0 - part) * force + part * new
     held = rows[now > 1e-6]
     along = null_space(held / root) if len(held) else np.eye(len(x))
@@ -305,11 +305,11 @@ def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
     m = len(obstacles)
     which = np.concatenate([np.repeat(np.arange(m), n), np.array([k for _, _, k in cuts], dtype=np.intp)])
     node = np.concatenate([np.tile(ends, m), touch])
-    slot = np.concatenate([np.arange(m * n), (m + which[m * n :]) * n + at])
+    key = np.concatenate([np.arange(m * n), (m + which[m * n :]) * n + at])
     return _Look(
         rod=fine,
         chain=chain,
-        slot=slot,
+        key=key,
         node=node,
         gap=np.array([found[k].value[p] for k, p in zip(which, node, strict=True)]) - rod.rho,
         normal=np.array([found[k].normal[p] for k, p in zip(which, node, strict=True)]).reshape(-1, 3),
@@ -408,7 +408,7 @@ def _answer(
 ) -> Minimum:
     look = _look(rod, obstacles, x)
     contact = np.zeros((len(look.rod.step) + 1, 3))
-    np.add.at(contact, look.node + 1, force[look.slot][:, None] * look.normal)
+    np.add.at(contact, look.node + 1, force[look.key][:, None] * look.normal)
     positions = np.concatenate([rod.base_position[None], look.chain.node])
     gaps = [o.distance(positions).value - rod.rho for o in obstacles]
     gap = np.min(gaps, axis=0) if gaps else np.full(len(positions), np.inf)
@@ -416,7 +416,7 @@ def _answer(
     chain = chain_of(rod, u)
     stretch, direction = stretch_of(rod, u)
     tension = stretch / rod.compliance
-    # moment of rod and wires in the middle of the first three elements, in the world, carried on to the base
+    # moment of rod and tendons in the middle of the first three elements, world, carried on to the base
     pull = np.einsum("i,ji,jix->jx", tension, rod.crossing, np.cross(rod.offset, direction))
     moment = rod.stiffness * (u - rod.precurvature) + pull
     turned = np.einsum("jxy,jy->jx", chain.start @ rotation_of(0.5 * rod.step[:, None] * u), moment)

@@ -265,7 +265,7 @@ def pose(inputs: Inputs, seal: Seal) -> tuple[Array, Array]:
 def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[Array, Array]:
     """Lengths that reach the rod (n, tendons) [m] and the bend they ask for (n, segments, 2) [rad].
 
-    Pairs p [m] (half the difference of two opposite wires) carry the effects; what the two tendons share
+    Pairs p [m] (half the difference of two opposite tendons) carry the effects; what the two tendons share
     stays as commanded.
     """
     t, segments = inputs.t, inputs.segments
@@ -387,7 +387,7 @@ def _hidden_rod(segments: int, effects: dict[str, dict[str, Any]]) -> Rod:
     if e := effects.get("tendon_stretch"):  # the share lost is rho / (1 + rho), with rho = k_b c / (2 d^2)
         rho = e["gain_loss"] / (1.0 - e["gain_loss"])
         rod = replace(rod, compliance=2.0 * OFFSET**2 * rho * LENGTH / EI)
-    if e := effects.get("routing_angle"):  # opposite wires turn together: otherwise they would lock
+    if e := effects.get("routing_angle"):  # opposite tendons turn together: otherwise they would lock
         turned = np.repeat(e["angle"].reshape(-1, 1, 2), 2, axis=1).reshape(-1)
         rod = replace(rod, angle=angles(segments) + turned)
     if e := effects.get("gravity"):
