@@ -14,7 +14,7 @@ from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
 from fastrod.kernels.batch import arrange, search_parallel, search_serial, search_worlds
 from fastrod.kernels.contact.iteration import NOTHING
-from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.problem import MOST_FOUND, contact_problem
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.types import (
@@ -23,6 +23,7 @@ from fastrod.types import (
     TROUBLE,
     Clearance,
     ContactMotion,
+    ContactProblem,
     ContactRods,
     ContactRows,
     ContactSet,
@@ -32,9 +33,11 @@ from fastrod.types import (
     PointLoads,
     Ports,
     RodShape,
+    SearchWork,
 )
 
 _FEW = 64  # robots below which starting threads costs more than it saves
+_MOST_WORKSPACES = 16  # sizes of contact problem that are kept
 
 
 class ContactSnapshot(NamedTuple):
@@ -79,6 +82,12 @@ class Engine:
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
+        self._workspace: dict[tuple[int, ...], tuple[ContactProblem, SearchWork]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What `pickle` and `copy` take: a workspace holds nothing between two iterations, and two engines
+        never share one."""
+        return {**self.__dict__, "_workspace": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take up what `pickle` or `copy` made: compiled shapes stand elsewhere in another process."""
@@ -133,7 +142,7 @@ class Engine:
     def in_worlds(self, rows: Ints) -> ContactRows:
         """`rows` (n,) world by world."""
         ordered = rows[np.argsort(self.world[rows], kind="stable")]
-        start = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+        start = starts_of(self.world[ordered])
         return ContactRows(start, ordered, np.zeros(0, np.int64), self.trouble[:0], np.zeros((0, 0)))
 
     @property
@@ -245,6 +254,19 @@ class Engine:
             np.add.at(node_force, (rows, node[rows, q]), force[rows, q])
         return ports._replace(grid=grid, node_force=node_force)
 
+    def workspace(
+        self, threads: int, n_rows: int, n_loads: int, n_x: int
+    ) -> tuple[ContactProblem, SearchWork]:
+        """Room for contact problems of at most `n_rows` rows with `n_loads` contacts, and for the search
+        after them; kept, as one robot's iteration takes a millisecond."""
+        size = (threads, n_rows, n_loads, n_x)
+        if size not in self._workspace:
+            if len(self._workspace) >= _MOST_WORKSPACES:
+                self._workspace.clear()
+            problem = contact_problem(*size, self.contact_set.contact.shape[1])
+            self._workspace[size] = problem, search_work(threads, self.clearance.distance.shape[1])
+        return self._workspace[size]
+
     def thread_count(self, n: int) -> int:
         """Threads for n robots, or worlds."""
         return 1 if n <= _FEW else min(self.threads, n)
@@ -272,6 +294,13 @@ class Engine:
             tolerance=tolerance,
             margin=self.scene.watch,
         )
+
+
+def starts_of(world: Ints) -> Ints:
+    """Where each world begins in `world` (n,), in which rows of the same one stand together; and n."""
+    new = np.ones(len(world) + 1, bool)
+    np.not_equal(world[1:], world[:-1], out=new[1:-1])
+    return np.flatnonzero(new)
 
 
 def motion_of(

@@ -14,14 +14,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fastrod.contact.engine import Engine
+from fastrod.contact.engine import Engine, starts_of
 from fastrod.contact.frames import blended, longest_move
 from fastrod.contact.progress import Damping, Progress
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT
 from fastrod.kernels.batch import iterate_parallel, iterate_serial
 from fastrod.kernels.contact.iteration import AT_REST, BACK, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
-from fastrod.kernels.contact.problem import contact_problem
-from fastrod.kernels.contact.proximity import search_work
 from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, PointLoads, Ports, RodShape
 
 COLD_ITERATIONS = 2000
@@ -285,10 +283,13 @@ class ContactStep:
             2 ** np.ceil(np.log2(np.maximum(most[engine.world[rows]], 1))).astype(np.int64),
             engine.scene.max_contacts,
         )
+        if len(rows) <= _BLOCK and (room == room[0]).all():
+            yield np.argsort(engine.world[rows], kind="stable"), int(room[0])
+            return
         for n_loads in np.unique(room):
             members = np.flatnonzero(room == n_loads)
             members = members[np.argsort(engine.world[rows[members]], kind="stable")]
-            starts = np.flatnonzero(np.diff(engine.world[rows[members]], prepend=-1))
+            starts = starts_of(engine.world[rows[members]])[:-1]
             cuts = np.unique(np.searchsorted(starts, np.arange(_BLOCK, len(members), _BLOCK)))
             for block in np.split(members, starts[cuts[cuts < len(starts)]]):
                 yield block, int(n_loads)
@@ -298,11 +299,10 @@ class ContactStep:
         engine, n, n_x = self.engine, len(rows), self.solver.x.shape[1]
         loads = empty_loads(n, n_loads, n_x)
         self.solver.run_loaded(rows, engine.arranged(rows, ports, loads), self.shape, loads)
-        start = np.append(np.flatnonzero(np.diff(engine.world[rows], prepend=-1)), n)
+        start = starts_of(engine.world[rows])
         threads = engine.thread_count(len(start) - 1)
         contacts = engine.contact_set
-        problem = contact_problem(threads, int(np.diff(start).max()), n_loads, n_x, contacts.contact.shape[1])
-        search = search_work(threads, self.shape.arclength.shape[1])
+        problem, search = engine.workspace(threads, int(np.diff(start).max()), n_loads, n_x)
         used, contact = contacts.used[rows], contacts.contact[rows, :n_loads]
         homeless = (loads.node < 0) & (np.arange(n_loads) < used[:, None])
         status = np.zeros(n, np.int64)
