@@ -23,13 +23,16 @@ def serve(host: str = "127.0.0.1", port: int | None = None) -> Served:
 def _push_from_any_thread() -> None:
     """viser 1.1 wakes its senders from the thread that draws, while its own thread may be changing the queue
     of those who wait: once in some hours of motion that raises in the middle of a picture. By then the
-    message is in the buffer; only the waking is left to do."""
+    message is in the buffer; only the waking is left to do. A page that leaves while a thread draws for it
+    takes no message any more: viser would warn, and keep what it never sends."""
     from viser.infra._async_message_buffer import AsyncMessageBuffer
 
     plain: Any = AsyncMessageBuffer.push
 
     @functools.wraps(plain)
     def push(self: Any, message: Any) -> None:
+        if self.done:
+            return
         try:
             plain(self, message)
         except RuntimeError as error:
