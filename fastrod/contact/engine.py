@@ -37,7 +37,8 @@ from fastrod.types import (
 )
 
 _FEW = 64  # robots below which starting threads costs more than it saves
-_MOST_WORKSPACES = 16  # sizes of contact problem that are kept
+_MOST_WORKSPACES = 16  # sizes of contact problem whose room is kept
+_MOST_POINTS = 64  # contacts of a kept one: 1.2 MB a thread; of a larger one the solve takes far longer
 
 
 class ContactSnapshot(NamedTuple):
@@ -257,15 +258,21 @@ class Engine:
     def workspace(
         self, threads: int, n_rows: int, n_loads: int, n_x: int
     ) -> tuple[ContactProblem, SearchWork]:
-        """Room for contact problems of at most `n_rows` rows with `n_loads` contacts, and for the search
-        after them; kept, as one robot's iteration takes a millisecond."""
+        """Room, once for each thread, for worlds of at most `n_rows` rows with `n_loads` contacts and `n_x`
+        unknowns each, and for the search after them. Small ones are kept: to make one took 60 us of an
+        iteration's millisecond (16 robots on a bar)."""
         size = (threads, n_rows, n_loads, n_x)
-        if size not in self._workspace:
+        if (found := self._workspace.get(size)) is not None:
+            return found
+        made = (
+            contact_problem(*size, self.contact_set.contact.shape[1]),
+            search_work(threads, self.clearance.distance.shape[1]),
+        )
+        if n_rows * n_loads <= _MOST_POINTS:
             if len(self._workspace) >= _MOST_WORKSPACES:
                 self._workspace.clear()
-            problem = contact_problem(*size, self.contact_set.contact.shape[1])
-            self._workspace[size] = problem, search_work(threads, self.clearance.distance.shape[1])
-        return self._workspace[size]
+            self._workspace[size] = made
+        return made
 
     def thread_count(self, n: int) -> int:
         """Threads for n robots, or worlds."""
@@ -297,7 +304,8 @@ class Engine:
 
 
 def starts_of(world: Ints) -> Ints:
-    """Where each world begins in `world` (n,), in which rows of the same one stand together; and n."""
+    """(n_worlds + 1,) where each world begins in `world` (n,), in which rows of the same one stand together;
+    and n."""
     new = np.ones(len(world) + 1, bool)
     np.not_equal(world[1:], world[:-1], out=new[1:-1])
     return np.flatnonzero(new)

@@ -3,7 +3,9 @@ happen."""
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -350,6 +352,16 @@ def test_a_snapshot_holds_the_contacts():
     assert_allclose(again.contacts.force, first.contacts.force, rtol=0, atol=0)
     with pytest.raises(FastrodError, match="contact scene"):
         fastrod.Simulator(prototype(1e-5)).restore(snapshot)
+
+
+def test_small_workspaces_are_kept_and_never_shared():
+    floor = ContactScene(obstacles=[plane((0.0, 0.0, -1.0), name="floor")])
+    engine = fastrod.Simulator(prototype(), contact=floor)._engine
+    small, large = (1, 1, 4, 7), (1, 2, 64, 7)
+    assert engine.workspace(*small) is engine.workspace(*small)
+    assert engine.workspace(*large) is not engine.workspace(*large)
+    for twin in (copy.copy(engine), pickle.loads(pickle.dumps(engine))):
+        assert twin.workspace(*small) is not engine.workspace(*small)
 
 
 def test_tip_outputs_touch_as_full_ones_do():
