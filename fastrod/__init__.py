@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from fastrod.errors import Problem
 from fastrod.loading import load_robot
-from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Lump, Robot, Segment, Tendon
 from fastrod.model.robotfile import robot_names, save_robot
 from fastrod.moved import refuse_old_names
 
@@ -12,9 +12,13 @@ if TYPE_CHECKING:
     from fastrod import reference
     from fastrod.hosts.rod import Rod
     from fastrod.simulator import Simulator
+    from fastrod.solver.modal import Modes
     from fastrod.solver.state import Observer, Pose, State
+    from fastrod.solver.tape import Tips
 
 __all__ = [
+    "Lump",
+    "Modes",
     "Observer",
     "Pose",
     "Problem",
@@ -24,17 +28,20 @@ __all__ = [
     "Simulator",
     "State",
     "Tendon",
+    "Tips",
     "load_robot",
     "reference",
     "robot_names",
     "save_robot",
 ]
 _HOME = {
+    "Modes": "solver.modal",
     "Observer": "solver.state",
     "Pose": "solver.state",
     "Rod": "hosts.rod",
     "Simulator": "simulator",
     "State": "solver.state",
+    "Tips": "solver.tape",
 }
 
 refuse_old_names()

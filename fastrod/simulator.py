@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,31 +17,31 @@ from fastrod.effects.executor import SensedPoses, from_base
 from fastrod.errors import InputError, Problem
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
+from fastrod.solver import options
 from fastrod.solver.contact_solver import RodSolver
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.inputs import (
     Inputs,
     PointForces,
     arclengths,
-    check_options,
     check_positive,
-    checked_robots,
     mobility,
     named_inputs,
-    renamed_options,
     robot_mask,
 )
+from fastrod.solver.modal import Modes
+from fastrod.solver.motion import Motions
 from fastrod.solver.recovery import Boundary, overloaded
 from fastrod.solver.response import stretch
-from fastrod.solver.state import Observer, Pose, State
-from fastrod.solver.statics import DIVERGED, Statics
-from fastrod.types import Floats, Ports
+from fastrod.solver.state import Observer, Pose, State, check_on_robot
+from fastrod.solver.statics import DIVERGED
+from fastrod.solver.stepper import unloaded
+from fastrod.types import Floats
 
-_config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 
 
-class Simulator(Statics):
+class Simulator(Motions):
     """Many tendon-driven continuum robots at once.
 
     >>> import fastrod
@@ -53,7 +52,7 @@ class Simulator(Statics):
     array([ True,  True])
     """
 
-    @renamed_options(hold_gain="kept_jacobian_tolerance")
+    @options.renamed_options(hold_gain="kept_jacobian_tolerance")
     def __init__(
         self,
         robot: Robot | Sequence[Robot],
@@ -69,6 +68,11 @@ class Simulator(Statics):
         feel_contact: bool = True,
         device: devices.Device = "cpu",
         recover: bool = True,
+        solver: Literal["observer", "modal"] | None = None,
+        dynamics: bool = False,
+        scheme: Literal["bdf1", "bdf2", "generalized_alpha"] = "generalized_alpha",
+        rho: float = 0.5,
+        modes: Modes | None = None,
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
@@ -87,25 +91,23 @@ class Simulator(Statics):
         With `device="cuda"` the passes run on an NVIDIA GPU, one thread a robot, from the same source:
         numbers agree to rounding. The memory of the observer stays there; a step sends the inputs that
         changed and brings back what `outputs` asks for, so for large batches ask for "tip". Everything else
-        is done on the CPU, as are the Newton steps of `settle`. Rods that feel contact need the CPU. Raises
-        `InputError` (also where there is no GPU), `RobotError`, `UnknownNameError`.
+        is done on the CPU, as are the Newton steps of `settle`. Rods that feel contact need the CPU.
+
+        `solver` is "observer", one forward integration a step (the default), or "modal": rods of curvature
+        modes, which robots with axial or shear stiffness or with `dynamics` take. Then a step brings a robot
+        to rest on its inputs, or with `dynamics` moves it on by `dt`: every segment needs a line_density.
+        `scheme` is "generalized_alpha" (second order, `rho` from 0 to 0.9 damps high frequencies), "bdf2" or
+        "bdf1"; `modes` says how finely a segment is resolved. Not with contact, a GPU or an observer.
+
+        Raises `InputError` (also where there is no GPU), `RobotError`, `UnknownNameError`.
         """
-        robots, n_robots = checked_robots(robot, n_robots)
-        most_threads = int(_config.NUMBA_NUM_THREADS)
-        check_options(points_per_segment, dt, outputs, threads, most_threads, kept_jacobian_tolerance)
-        if observer is not None and not isinstance(observer, Observer):
-            raise InputError(f"observer is {observer!r}; give fastrod.Observer(...) or None.")
-        if contact is not None and not isinstance(contact, ContactScene):
-            raise InputError(
-                f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
-            )
+        robots, n_robots = options.checked_robots(robot, n_robots)
+        options.check_options(points_per_segment, dt, outputs, kept_jacobian_tolerance)
+        self.solver = options.check_solver(robots, solver, bool(dynamics), scheme, rho, modes)
+        """How rods are solved: "observer" or "modal"."""
         self.device = devices.checked(device)
         """Where the passes run."""
-        if self.device == "cuda" and contact is not None and feel_contact:
-            raise InputError(
-                "contact was given with device 'cuda', where rods feel none; take "
-                "device='cpu', or feel_contact=False."
-            )
+        options.check_fellows(self.solver, observer, contact, feel_contact, device, kept_jacobian_tolerance)
         super().__init__(
             robots,
             n_robots,
@@ -113,11 +115,13 @@ class Simulator(Statics):
             int(points_per_segment),
             outputs=outputs,
             observer=observer,
-            threads=threads or numba.get_num_threads(),
+            threads=options.checked_threads(threads),
             device=self.device,
             kept_jacobian_tolerance=float(kept_jacobian_tolerance),
             recover=bool(recover),
         )
+        if self.solver == "modal":
+            self._use_modes(bool(dynamics), scheme, rho, modes)
         self.contact: ContactScene | None = contact
         """What the rods may touch."""
         if contact is not None:
@@ -150,8 +154,13 @@ class Simulator(Statics):
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
         obstacle_velocity: Mapping[str, ArrayLike] | None = None,
         derive: bool = False,
+        passes: int = 1,
+        estimate_error: bool = False,
     ) -> State:
-        """One observer pass: one forward integration per robot.
+        """One observer pass: one forward integration per robot. With rods of modes: the rest on these inputs,
+        or with `dynamics` one step of `dt`, whose inputs are those at its end, by at least so many `passes`
+        of Newton's method; `estimate_error` repeats it as two steps of dt / 2, and `state.step_error` says
+        how far apart they end.
 
         Every input has shape (n_robots, ...), or without the robot axis for all. What is not given is zero,
         or the robot's own. `tendon_length` (n_tendons,) absolute, base to where the tendon ends [m];
@@ -193,6 +202,7 @@ class Simulator(Statics):
         )
         if self._felt is not None:
             return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
+        self._spend(passes, estimate_error)
         return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
 
     @named_inputs
@@ -286,7 +296,7 @@ class Simulator(Statics):
             end=ports,
             tolerance=tolerance or _AT_REST,
             most=engine.scene.max_iterations if tolerance is None else COLD_ITERATIONS,
-        ).run(rows, self._warm, start, self._unloaded(ports))
+        ).run(rows, self._warm, start, unloaded(ports, self._layout, self._passes.params))
         for i in rows[~ok[rows]]:
             if engine.continued[i] and not overloaded(self._passes, ports, int(i)):
                 why = engine.why(int(i), float(done[i]))
@@ -306,27 +316,18 @@ class Simulator(Statics):
         self._warm[held] = True  # it stands where it came to, and goes on from there
         return state
 
-    def _unloaded(self, ports: Ports) -> Ports:
-        """The straight robot on the same base, without loads."""
-        ends = np.cumsum(self._passes.params.length + ports.extension, axis=1)[:, self._layout.tendon_segment]
-        zeros: dict[str, Any] = {
-            name: 0.0 * getattr(ports, name)
-            for name in ("tension", "tip_force", "tip_moment", "follower_force", "line_force", "node_force")
-        }
-        return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
-
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
 
         Between nodes the rod is integrated from the node before, so the answer has the integrator's order
         everywhere.
         """
+        if self.solver == "modal":
+            return self._modal_shape(self._full("shape"), arclength)
         state, ports = self._full("shape"), self._last("shape")[1]
         s = arclengths(arclength, self.n_robots)
+        check_on_robot(s, state)
         end = state.arclength[:, -1:]
-        if (bad := ~((s >= 0.0) & (s <= end * (1.0 + 1e-9))) & state.ok[:, None]).any():
-            i, j = np.argwhere(bad)[0]
-            raise InputError(f"arclength {s[i, j]:.6g} m; robot {i} runs from 0 to {end[i, 0]:.6g} m.")
         found = Pose(*(np.full((*s.shape, *axes), np.nan) for axes in ((3,), (3, 3), (3,))))
         robot, query = np.nonzero(np.broadcast_to(np.isfinite(end), s.shape))
         between_nodes(
@@ -347,11 +348,11 @@ class Simulator(Statics):
 
         Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the
         other inputs held: a point force at its arclength. With effects, the inputs are those commanded, and
-        the effects stay where they are in their loops; what only follows in time (latency, dynamics) answers
-        nothing at once: its columns are zero. A slack tendon's column is zero, a robot's that is not ok nan.
-        Columns of lengths come from the sensitivities of the pass; those of tensions and extensions from
-        central differences of the pass, closed by the same sensitivities. Contact forces are held as they
-        are.
+        the effects stay where they are in their loops; what only follows in time (latency, second-order lag)
+        answers nothing at once: its columns are zero. A slack tendon's column is zero, a robot's that is not
+        ok nan. Columns of lengths come from the sensitivities of the pass; those of tensions and extensions
+        from central differences of the pass, closed by the same sensitivities. Contact forces are held as
+        they are.
 
         With `turning`, three columns more: by the rotation vector of the base about its origin, world [rad].
         World loads keep their direction, so the rod bends under them as it rotates.
@@ -360,7 +361,7 @@ class Simulator(Statics):
         if self._derived is not None:
             return self._derived[:, :, : None if turning else -3]
         follows = self._felt is None and bool(self._given.point_force)
-        jacobian = self._linear(ports).jacobian(self._relocated if follows else None, turning)
+        jacobian: Floats = self._linear(ports).jacobian(self._relocated if follows else None, turning)
         if self._bare is None:
             return jacobian
         slopes = self._chain.slopes(self._bare, self._plain, self._state, self.dt, self._layout.n_steps)
@@ -370,7 +371,7 @@ class Simulator(Statics):
     def compliance(self) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation
         and contact forces held."""
-        return self._linear(self._last("compliance")[1]).by_force()
+        return np.asarray(self._linear(self._last("compliance")[1]).by_force())
 
     def set_free(
         self,
@@ -437,12 +438,6 @@ class Simulator(Statics):
                 "contact=fastrod.contact.ContactScene(...))."
             )
         return self._engine
-
-    def _full(self, what: str) -> State:
-        state, _ = self._last(what)
-        if self.outputs != "full":
-            raise InputError(f"{what} needs Simulator(..., outputs='full'); this one keeps the tip only.")
-        return state
 
     def measure(self) -> SensedPoses:
         """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in

@@ -13,7 +13,7 @@ import pytest
 from rods import rod
 
 import fastrod.reference as reference
-from fastrod import Observer, Robot, Segment, Simulator, Tendon, load_robot
+from fastrod import Lump, Modes, Observer, Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.commands.demo import run as demo
 from fastrod.contact import ContactScene, sphere
 from fastrod.control.inverse import plan
@@ -242,7 +242,95 @@ SEGMENT = "[[segment]]\nlength = 0.07\nbending_stiffness = [0.002, 0.002]\ntorsi
 A = 'name = "a"\n' + SEGMENT
 TENDON = "tendons = [{offset = 0.01, angle = 0.0"
 
+
+def moving(robot: Robot | None = None, **options: Any) -> Simulator:
+    return Simulator(robot or rod(line_density=0.1), points_per_segment=4, **{"dynamics": True} | options)
+
+
+def settled_moving(**options: Any) -> Simulator:
+    sim = moving(**options)
+    sim.settle(REST)
+    return sim
+
+
+MOTION: Rows = [
+    (
+        lambda: moving(rod()),
+        r"^segment 1 of 'tendon_length' has line_density 0 kg/m, and dynamics=True needs",
+    ),
+    (lambda: moving(rod("paper", line_density=0.1)), "^mode 'paper' has no energy, and so no modes; take"),
+    (lambda: Simulator(rod("paper"), solver="modal"), "^mode 'paper' has no energy, and so no modes; take"),
+    (lambda: Simulator(rod(), solver="modl"), "^solver is 'modl'; did you mean 'modal'"),
+    (lambda: Simulator(rod(), solver=3), "^solver is 3; known: modal, observer"),
+    (
+        lambda: moving(solver="observer"),
+        "^solver is 'observer' with dynamics=True, which needs solver='modal'",
+    ),
+    (
+        lambda: Simulator(rod(axial_stiffness=9.0), solver="observer"),
+        "^solver is 'observer' with a robot with axial_stiffness",
+    ),
+    (
+        lambda: Simulator(rod(lumps=(Lump(at=0.01, mass=0.1),)), solver="observer"),
+        "^solver is 'observer' with a robot with lumps",
+    ),
+    (lambda: moving(scheme="bdf3"), "^scheme is 'bdf3'; did you mean 'bdf2'"),
+    (lambda: moving(scheme=["bdf1"]), r"^scheme is \['bdf1'\]; did you mean 'bdf1'"),
+    *(
+        (lambda rho=rho: moving(rho=rho), f"^rho is {rho!r}; give a number from 0 .* to 0.9")
+        for rho in (1, -0.1, np.nan, "half")
+    ),
+    (lambda: moving(dt=0.0), "^dt is 0.0 s; it must be a number, positive and finite"),
+    (lambda: moving(dynamics=False, scheme="bdf2"), "^scheme is 'bdf2' without dynamics, and nothing moves"),
+    (lambda: moving(dynamics=False, rho=0.8), "^rho is 0.8 without dynamics"),
+    (lambda: moving(modes=(4, 2)), r"^modes is \(4, 2\); give fastrod.Modes\(bending=4, torsion=2\)"),
+    *(
+        (
+            lambda name=name, value=value: moving(modes=Modes(**{name: value})),
+            f"^modes has {name}={value!r}; give a whole number from 1 to {16 if name == 'pieces' else 8}",
+        )
+        for name, value in (("bending", 0), ("torsion", 9), ("strain", 1.5), ("pieces", "two"))
+    ),
+    (lambda: Simulator(rod(), modes=Modes(4, 2)), "^modes was given to the observer, which has none"),
+    (
+        lambda: moving(contact=scene()),
+        "^contact was given with rods of modes, which feel none yet; take solver",
+    ),
+    (lambda: moving(observer=Observer()), "^observer was given with rods of modes"),
+    (lambda: moving(kept_jacobian_tolerance=1e-6), "^kept_jacobian_tolerance was given with rods of modes"),
+    *(
+        (lambda n=n: moving().step(REST, passes=n), f"^passes is {n!r}; give a whole number from 1 to 100")
+        for n in (0, 101, 1.5, "two")
+    ),
+    (lambda: Simulator(rod()).step(REST, passes=2), "^passes is 2; the observer takes one a step"),
+    (lambda: moving().step(REST, extension=[0.01]), r"^extension \[0.01\] m lies outside the range"),
+    (lambda: moving().frequencies(), "^frequencies needs a state; call step or settle first"),
+    (lambda: settled(rod()).frequencies(), "^frequencies needs inertia; give Simulator"),
+    (lambda: settled_moving().frequencies(0), "^count is 0; give a whole number, at least 1"),
+    (lambda: settled_moving().frequencies(99), "^count is 99; these rods have 10 unknowns: give more modes"),
+    (lambda: settled_moving().settle(REST, tolerance=0.0), "^tolerance is 0.0 m"),
+]
+
 ROBOTS: Rows = [
+    (lambda: Lump(at=-0.01, mass=0.1), "^Lump.at is -0.01 m; it must lie on its segment"),
+    (lambda: Lump(at="end", mass=0.1), "^Lump.at is 'end' m; it must lie on its segment"),
+    (lambda: Lump(at=0.01, mass=-0.1), "^Lump.mass is -0.1 kg; it must be zero or positive"),
+    (lambda: Lump(at=0.01, mass=0.1, inertia=1.0), "^Lump.inertia is 1.0; give the three moments"),
+    (lambda: Lump(at=0.01, mass=0.1, inertia=(1.0, 1.0, 3.0)), "no body has it"),
+    (lambda: rod(lumps=(Lump(at=0.08, mass=0.1),)), "^Lump.at is 0.08 m, beyond the 0.07 m of its segment"),
+    (lambda: rod(lumps=(0.1,)), r"^Segment.lumps is \(0.1,\); give a tuple of Lump"),
+    (
+        lambda: Simulator([rod(lumps=(Lump(at=0.01, mass=0.1),)), rod()]),
+        "^robot 1 of the batch has lumps on other segments than robot 0, or more or fewer",
+    ),
+    (lambda: rod(damping_time=-1e-3), "^Segment.damping_time is -0.001 s; it must be zero or positive"),
+    (lambda: rod(damping_time="long"), "^Segment.damping_time is 'long' s"),
+    (lambda: rod(axial_stiffness=0.0), "^Segment.axial_stiffness is 0.0 N; it must be positive, or left out"),
+    (lambda: rod(shear_stiffness=math.nan), "^Segment.shear_stiffness is nan N; it must be positive"),
+    (lambda: loads(A + "lumps = [{at = 0.08, mass = 0.1}]\n" + TENDON + "}]"), "beyond the 0.07 m"),
+    (lambda: loads(A + "lumps = [{at = 0.01, mas = 0.1}]\n" + TENDON + "}]"), "did you mean 'mass'"),
+    (lambda: loads(A + "lumps = [{at = 0.01}]\n" + TENDON + "}]"), "mass"),
+    (lambda: loads(A + "damping_tme = 0.1\n" + TENDON + "}]"), "did you mean 'damping_time'"),
     (lambda: loads('name = "a"'), "no segments"),
     (lambda: loads(SEGMENT + 'mode = "passive"'), "no name"),
     (lambda: loads('name = "a"\nlenght = 3\n'), "unknown key 'lenght'"),
@@ -436,7 +524,7 @@ OTHERS: Rows = [
 ]
 
 REFUSED = [
-    *((InputError, *row) for row in INPUTS + SIMULATORS),
+    *((InputError, *row) for row in INPUTS + SIMULATORS + MOTION),
     *((RobotError, *row) for row in ROBOTS),
     *((UnknownNameError, *row) for row in NAMES),
     (LogError, lambda: read_log("a\0.csv", PROTOTYPE), r"cannot be read: embedded null byte\."),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import float64
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 
@@ -53,8 +54,7 @@ def test_hot_loops_are_simd_code() -> None:
     rod_sim = Simulator(rod(), points_per_segment=3)
     rod_sim.step(rod().rest_tendon_length)
     if not step_column.signatures:  # loaded from the cache: compile this one for its assembly
-        a = np.zeros(2000)
-        step_column(a.copy(), a.copy(), a.copy(), a.copy(), a.copy())
+        step_column.compile((float64[::1],) * 5)
     assembly = step_column.inspect_asm(step_column.signatures[0])
     assert assembly.count("zmm") + assembly.count("ymm") > 200
 

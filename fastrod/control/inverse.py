@@ -99,8 +99,8 @@ def plan(
     corrected by `gain` times what, on the robot without effects of actuation, leads from the measured tip to
     the path, and so on, until no correction is above `tolerance` [m], for at most `rollouts` simulations. A
     correction that made it worse (one that rings) is taken back, and made smoother in time; the best is kept.
-    What rings slowly (`dynamics` of a period of many samples) is corrected only partly. Source: iterative
-    learning control (Arimoto, Kawamura and Miyazaki 1984), here on the model. Raises `InputError` on what is
+    What rings slowly (a lag of many samples) is corrected only partly. Source: iterative learning
+    control (Arimoto, Kawamura and Miyazaki 1984), here on the model. Raises `InputError` on what is
     not such a path or number, where the robot's shape is not found, and where a tendon would move faster than
     `rate_limit` [m/s]; `RobotError` where the robot is not one for `SegmentActions`.
     """

@@ -18,6 +18,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
 from .notice import announce
@@ -73,7 +74,7 @@ def kernel(function: _Function) -> _Function:
     Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as
     much as the arithmetic. A kernel may therefore slice arrays but not make them.
     """
-    return cast(_Function, _njit(error_model="numpy", fastmath=_FAST, nogil=True, _nrt=False)(function))
+    return _inner(function, nogil=True)
 
 
 def entry(function: _Function) -> _Function:
@@ -93,7 +94,32 @@ def inline(function: _Function) -> _Function:
 
     numba's own inline="always" pastes before typing and compiles three times as long.
     """
-    return cast(_Function, _njit(forceinline=True, error_model="numpy", fastmath=_FAST, _nrt=False)(function))
+    return _inner(function, forceinline=True)
+
+
+_UNWRAPPED = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class _Inner(CPUDispatcher):
+    """What kernels call. Numba's wrappers for Python and C took half the time of the compiler, so it has
+    none; the first call from Python compiles the function once more, with them."""
+
+    wrapped: Callable[..., Any] | None = None
+
+    def __call__(self, *given: Any) -> Any:
+        if self.wrapped is None:
+            left_out = {*_UNWRAPPED, "nopython", "boundscheck"}
+            self.wrapped = _njit(**{k: v for k, v in self.targetoptions.items() if k not in left_out})(
+                self.py_func
+            )
+        return self.wrapped(*given)
+
+
+def _inner(function: _Function, **options: bool) -> _Function:
+    made = _njit(error_model="numpy", fastmath=_FAST, _nrt=False, **_UNWRAPPED, **options)(function)
+    if not _config.DISABLE_JIT:
+        made.__class__ = _Inner
+    return cast(_Function, made)
 
 
 def _compile(function: _Function, folder: str | None = CACHE_DIR, **options: bool) -> _Function:

@@ -52,6 +52,11 @@ def compile_robots(robots: Sequence[Robot], n_steps: int) -> tuple[Layout, Param
                 f"robot {i} of the batch has other segment modes or tendon ends than robot 0; "
                 "they must agree."
             )
+        if [len(s.lumps) for s in robot.segments] != [len(s.lumps) for s in first.segments]:
+            raise RobotError(
+                f"robot {i} of the batch has lumps on other segments than robot 0, or more or fewer; their "
+                "counts must agree: a lump of mass 0 stands for none."
+            )
     return _layout(first, n_steps), _params(robots), _rest(robots)
 
 

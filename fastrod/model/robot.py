@@ -27,6 +27,10 @@ _GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 _MOST = 1e9
 
 
+def _number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+
+
 def _positive(where: str, value: float, unit: str, low: float = 0.0, high: float = math.inf) -> None:
     if not (math.isfinite(value) and value > 0.0):
         raise RobotError(f"{where} is {value!r} {unit}; it must be positive and finite.")
@@ -108,6 +112,35 @@ class Tendon:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lump:
+    """A rigid mass on the backbone: a disk, a marker, a payload."""
+
+    at: float
+    """Arclength in its segment, without extension [m]."""
+    mass: float
+    """[kg]"""
+    inertia: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Moments of inertia about d1, d2, d3 through its centre, on the backbone [kg m^2]."""
+
+    def __post_init__(self) -> None:
+        if not _number(self.at) or not 0.0 <= self.at <= _LONGEST:
+            raise RobotError(f"Lump.at is {self.at!r} m; it must lie on its segment, from 0 to its length.")
+        if not _number(self.mass) or not 0.0 <= self.mass <= _MOST:
+            raise RobotError(f"Lump.mass is {self.mass!r} kg; it must be zero or positive, and finite.")
+        if not isinstance(self.inertia, (tuple, list)) or not all(map(_number, self.inertia)):
+            raise RobotError(
+                f"Lump.inertia is {self.inertia!r}; give the three moments about d1, d2 and d3 [kg m^2]."
+            )
+        _finite("Lump.inertia", self.inertia, 3, "kg m^2")
+        a, b, c = sorted(self.inertia)
+        if a < 0.0 or c > (a + b) * (1.0 + 1e-9):
+            raise RobotError(
+                f"Lump.inertia is {list(self.inertia)!r} kg m^2; no body has it: each must be zero or "
+                "positive, and none larger than the other two together."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Segment:
     """A length of backbone with one stiffness, and the tendons that end at its end."""
 
@@ -125,6 +158,14 @@ class Segment:
     """Radius of the body, for contact and drawing [m]; 0 stands for just beyond the outermost tendon."""
     line_density: float = 0.0
     """Mass per length [kg/m]; 0 is weightless."""
+    damping_time: float = 0.0
+    """Kelvin-Voigt damping [s]: the moment is EI (kappa + damping_time dkappa/dt), likewise torsion, shear
+    and stretch. Felt in motion only."""
+    axial_stiffness: float = math.inf
+    """EA [N]; inf: the backbone does not stretch."""
+    shear_stiffness: float = math.inf
+    """GA times the shear coefficient [N]; inf: cross-sections stay normal to the backbone."""
+    lumps: tuple[Lump, ...] = ()
     mode: Mode = "tendon_length"
     tendons: tuple[Tendon, ...] = ()
 
@@ -155,6 +196,25 @@ class Segment:
             raise RobotError(
                 f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive."
             )
+        if not _number(self.damping_time) or not 0.0 <= self.damping_time <= _MOST:
+            raise RobotError(
+                f"Segment.damping_time is {self.damping_time!r} s; it must be zero or positive, and finite."
+            )
+        for name in ("axial_stiffness", "shear_stiffness"):
+            if not _number(getattr(self, name)) or not getattr(self, name) > 0.0:
+                raise RobotError(
+                    f"Segment.{name} is {getattr(self, name)!r} N; it must be positive, or left out (inf)."
+                )
+        if not isinstance(self.lumps, (tuple, list)) or not all(isinstance(a, Lump) for a in self.lumps):
+            raise RobotError(
+                f"Segment.lumps is {self.lumps!r}; give a tuple of Lump(at=..., mass=...), in m and kg."
+            )
+        for lump in self.lumps:
+            if lump.at > self.length * (1.0 + 1e-9):
+                raise RobotError(
+                    f"Lump.at is {lump.at:g} m, beyond the {self.length:g} m of its segment; give its "
+                    "arclength in the segment."
+                )
         if self.mode not in MODES:
             raise RobotError(f"Segment.mode is {self.mode!r}; {nearest(str(self.mode), MODES)}")
         if self.mode == "passive" and self.tendons:

@@ -15,7 +15,7 @@ import msgspec
 import tomli_w
 
 from fastrod.errors import RobotError, UnknownNameError, nearest, shown
-from fastrod.model.robot import MODES, Robot, Segment, Tendon
+from fastrod.model.robot import MODES, Lump, Robot, Segment, Tendon
 from fastrod.tomlfile import parse, read_text
 
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
@@ -154,6 +154,12 @@ def _segment(table: Any, where: str) -> Segment:
     for k, tendon in enumerate(tendons, 1):
         _check_keys(tendon, [f.name for f in fields(Tendon)], f"{where}, tendon {k}")
         _check_needed(tendon, ("offset", "angle"), f"{where}, tendon {k}")
+    lumps = table.get("lumps", [])
+    if not isinstance(lumps, list):
+        raise RobotError(f"{where}: lumps must be a list of tables, [ {{at = ..., mass = ...}}, ... ].")
+    for k, lump in enumerate(lumps, 1):
+        _check_keys(lump, [f.name for f in fields(Lump)], f"{where}, lump {k}")
+        _check_needed(lump, ("at", "mass"), f"{where}, lump {k}")
     try:
         return msgspec.convert(table, Segment)
     except msgspec.ValidationError as error:
@@ -161,14 +167,20 @@ def _segment(table: Any, where: str) -> Segment:
 
 
 def _written(segment: Segment) -> dict[str, Any]:
-    data = {f.name: getattr(segment, f.name) for f in fields(Segment) if f.name != "tendons"}
-    data = {key: list(value) if isinstance(value, tuple) else value for key, value in data.items()}
-    if segment.tendons:
-        plain = [{f.name: getattr(tendon, f.name) for f in fields(Tendon)} for tendon in segment.tendons]
-        data["tendons"] = [
-            {key: list(v) if isinstance(v, tuple) else v for key, v in tendon.items()} for tendon in plain
-        ]
+    data = _plain_table(segment)
+    for name in ("axial_stiffness", "shear_stiffness"):
+        if math.isinf(data[name]):
+            del data[name]
+    for name in ("tendons", "lumps"):
+        data[name] = [_plain_table(each) for each in getattr(segment, name)]
+        if not data[name]:
+            del data[name]
     return data
+
+
+def _plain_table(each: Segment | Tendon | Lump) -> dict[str, Any]:
+    values = {f.name: getattr(each, f.name) for f in fields(each)}
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
 
 def _section(data: Mapping[str, Any], name: str, known: Iterable[str], where: str) -> dict[str, Any]:

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError, Problem, ProblemSentence, RobotError, nearest, refuse_masked, shown
+from fastrod.errors import InputError, Problem, ProblemSentence, nearest, refuse_masked, shown
 from fastrod.kernels.batch import place_all
 from fastrod.model.compile import DefaultInputs
-from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats, Layout, Params, Ports
 
 _P = ParamSpec("_P")
@@ -42,61 +41,10 @@ def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return checked
 
 
-def renamed_options(**now: str) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Old keyword -> the new one: a call with an old one raises `InputError`."""
-
-    def around(function: Callable[_P, _R]) -> Callable[_P, _R]:
-        @functools.wraps(function)
-        def checked(*args: _P.args, **options: _P.kwargs) -> _R:
-            for old in now.keys() & options.keys():
-                raise InputError(f"the option {old!r} is now {now[old]!r}.")
-            return function(*args, **options)
-
-        return checked
-
-    return around
-
-
-def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:
-    """The robots, one for all or one each, and their number. Raises `RobotError`, `InputError`."""
-    robots = (
-        (robot,) if isinstance(robot, Robot) else tuple(robot) if isinstance(robot, (list, tuple)) else ()
-    )
-    if not robots or not all(isinstance(r, Robot) for r in robots):
-        raise RobotError(
-            f"robot is {shown(robot)}; give a Robot, for example "
-            "fastrod.load_robot('prototype'), or a list of them."
-        )
-    n = len(robots) if n_robots is None else n_robots
-    if not isinstance(n, (int, np.integer)) or n < 1:
-        raise InputError(f"n_robots is {n!r}; it must be a whole number, at least 1.")
-    if len(robots) not in (1, n):
-        raise InputError(f"{len(robots)} robots for n_robots {n}; give one for all, or a list of n_robots.")
-    return robots, int(n)
-
-
 def check_positive(name: str, value: object, unit: str) -> None:
     """Raise `InputError` unless this is a positive number."""
     if not isinstance(value, (int, float, np.floating, np.integer)) or not 0.0 < value <= float_info.max:
         raise InputError(f"{name} is {shown(value)} {unit}; it must be a number, positive and finite.")
-
-
-def check_options(
-    points_per_segment: object, dt: object, outputs: object, threads: object, most_threads: int, kept: object
-) -> None:
-    """Raise `InputError` for an option of `Simulator` that cannot be; `kept` is its
-    `kept_jacobian_tolerance`."""
-    if not isinstance(points_per_segment, (int, np.integer)) or points_per_segment < 2:
-        raise InputError(
-            f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2."
-        )
-    check_positive("dt", dt, "s")
-    if outputs not in ("full", "tip"):
-        raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
-    if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= most_threads):
-        raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {most_threads} here.")
-    if not isinstance(kept, (int, float, np.floating)) or not 0.0 <= kept <= float_info.max:
-        raise InputError(f"kept_jacobian_tolerance is {kept!r} m; it must be a number, zero or positive.")
 
 
 def robot_mask(rows: ArrayLike, n_robots: int) -> Flags:

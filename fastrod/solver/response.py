@@ -14,7 +14,7 @@ from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Respo
 
 _ROWS = 1024  # of one pass: robots times copies of them
 _HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
-_ROTATIONS: Floats = np.array(
+ROTATIONS: Floats = np.array(
     [[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF]
 )[:, None]
 """(6, 1, 4, 4) what rotates a quaternion forward and back by 1e-4 rad about each axis of the world."""
@@ -168,7 +168,7 @@ class Linear:
             a[2 + 2 * j, :, i] -= delta[j]
         if turning:
             rotated = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
-            rotated[:] = (_ROTATIONS @ rotated[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
+            rotated[:] = (ROTATIONS @ rotated[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
         return moved, delta, pulled
 
     def _combine(self, response: Response, shape: RodShape, delta: Floats, pulled: list[int]) -> Floats:
@@ -246,13 +246,18 @@ def _split(a: Any, k: int) -> Any:
 def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:
     """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and
     back by turns."""
-    e, rotation = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
-    change = np.empty((*delta.shape, 6))
+    e, change = response.error, np.empty((*delta.shape, 6))
     change[..., :3] = p[::2] - p[1::2]
-    for a, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        change[..., 3 + a] = 0.5 * (rotation[..., i, j] - rotation[..., j, i])
+    change[..., 3:] = rotation_differences(r[::2], r[1::2])
     width = 2.0 * delta[..., None]
     return change / width, (e[::2] - e[1::2]) / width
+
+
+def rotation_differences(ahead: Floats, behind: Floats) -> Floats:
+    """(..., 3) rotation vectors from one rotation (..., 3, 3) to another that is near."""
+    rotation = ahead @ np.swapaxes(behind, -1, -2)
+    both = ((2, 1), (0, 2), (1, 0))
+    return np.stack([0.5 * (rotation[..., i, j] - rotation[..., j, i]) for i, j in both], axis=-1)
 
 
 def inverse(a: Floats) -> Floats:

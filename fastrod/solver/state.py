@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,6 +83,17 @@ class State:
     """Robot index -> what is wrong with it, for the robots that are not ok: a sentence (`problem_kinds`)."""
     contacts: Contacts | None = None
     """What touches what; None without a contact scene."""
+    velocity: Floats | None = None
+    """(n_robots, n_points, 3) world [m/s]; None but for rods of modes, as the three that follow."""
+    strain: Floats | None = None
+    """(n_robots, n_points, 3) shear along d1 and d2, and stretch."""
+    kinetic_energy: Floats | None = None
+    """(n_robots,) [J]"""
+    strain_energy: Floats | None = None
+    """(n_robots,) of the backbone [J]."""
+    step_error: Floats | None = None
+    """(n_robots,) by how much the tip is off by the last step alone [m]; None but where it was asked for, nan
+    of a robot that took none."""
 
     @property
     def problem_kinds(self) -> dict[int, Problem]:
@@ -120,6 +131,15 @@ class Pose(NamedTuple):
     """(n_robots, n_queries, 3) material frame [1/m]."""
 
 
+def check_on_robot(arclength: Floats, state: State) -> None:
+    """Raise `InputError` where one of (n_robots, n_queries) [m] is not on its robot."""
+    end = state.arclength[:, -1:]
+    bad = ~((arclength >= 0.0) & (arclength <= end * (1.0 + 1e-9))) & state.ok[:, None]
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        raise InputError(f"arclength {arclength[i, j]:.6g} m; robot {i} runs from 0 to {end[i, 0]:.6g} m.")
+
+
 class Snapshot(NamedTuple):
     """Everything that a later step depends on."""
 
@@ -137,6 +157,8 @@ class Snapshot(NamedTuple):
     time: Floats
     """(n_robots,) as effects count it [s]; nan before the first step."""
     contact: ContactSnapshot | None
+    moving: Any = None
+    """What rods of modes remember."""
 
 
 def check_snapshot(

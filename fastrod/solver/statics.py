@@ -358,7 +358,7 @@ class Statics:
             (force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any()
         )
 
-    def _linear(self, ports: Ports) -> Linear:
+    def _linear(self, ports: Ports) -> Any:
         """The linear response of the last state."""
         rows = np.flatnonzero(self._warm)
         if self._felt is None:
@@ -405,7 +405,7 @@ class Statics:
         solved = (
             ok if self._felt is None else ok & ~self._felt.continued
         )  # what touches something is held by it
-        if len(fallen := unstable(self._passes, ports, shape, np.flatnonzero(solved))):
+        if len(fallen := self._unstable(ports, shape, np.flatnonzero(solved))):
             ok, passes, self._derived = ok.copy(), np.array(passes), None
             ok[fallen], passes[fallen] = False, -1
             lost = np.union1d(lost, fallen)
@@ -437,6 +437,10 @@ class Statics:
                 ports = merge_arrays(ports, self._ports, ~only)
         self._ports = ports
         return self._return_state(shape, ok, passes, problems)
+
+    def _unstable(self, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
+        """Those of `rows` whose shape balances its loads, but would not stay."""
+        return unstable(self._passes, ports, shape, rows)
 
     def _return_state(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)

@@ -32,7 +32,7 @@ Size = Literal["small", "typical", "large"] | float
 _LIBRARY = """
 gravity payload tip_force friction backlash slack tendon_stretch coupling drum_gain encoder_offset
 routing_angle creep precurvature stiffness_taper stiffness_anisotropy stiffening axial_compression
-plastic_set time_drift temperature latency dynamics frame_misalignment marker_offset camera_scale lens
+plastic_set time_drift temperature latency second_order_lag frame_misalignment marker_offset camera_scale lens
 """
 LIBRARY = tuple(_LIBRARY.split())
 OUTSIDE = ("bump", "sway", "ripple", "contact", "slip", "magnet")
@@ -197,7 +197,7 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
             return {"gain": amount(0.03, 0.10) * signs(1)[0], "tau": log(40.0, 200.0)}
         case "latency":  # s, s per s
             return {"delay": amount(0.03, 0.2, 3.0), "skew": uniform(-1e-4, 1e-4)}
-        case "dynamics":  # Hz of each pair, damping ratio; `amount` sets the period
+        case "second_order_lag":  # Hz of each pair, damping ratio; `amount` sets the period
             frequency = 1.0 / amount(1.0 / 3.0, 1.0, 3.0) * uniform(0.9, 1.1, n_pairs)
             return {"frequency": frequency, "damping": uniform(0.15, 0.5)}
         case "frame_misalignment":  # rotation vector [rad], m
@@ -296,7 +296,7 @@ def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[A
         p = p - e["half_width"] * np.tanh(p / e["half_width"])
     if e := effects.get("creep"):
         p = p - sum(c * (p - _lag(t, p, tau)) for c, tau in zip(e["share"], e["tau"], strict=True))
-    if e := effects.get("dynamics"):
+    if e := effects.get("second_order_lag"):
         each = zip(p.T, e["frequency"], strict=True)
         p = np.stack([_ringing(t, x, f, e["damping"]) for x, f in each], axis=1)
     bend = (p @ to_bend.T).reshape(len(t), segments, 2)

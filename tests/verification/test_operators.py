@@ -612,7 +612,7 @@ def test_effects_of_the_camera_act_from_the_marker_on() -> None:
 
 @pytest.mark.parametrize(
     ("name", "values"),
-    [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})],
+    [("latency", {"delay": 0.12}), ("second_order_lag", {"period": 0.2}), ("creep", {"share": 0.2})],
 )
 def test_an_effect_on_the_tendons_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
     """Step by step, an operator is the base model on tendons that went through it."""

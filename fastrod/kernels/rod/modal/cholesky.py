@@ -1,0 +1,63 @@
+"""Symmetric positive definite systems, LANES of them side by side."""
+
+from __future__ import annotations
+
+import math
+
+from ...jit import kernel
+from ..lanes import LaneMatrix, Lanes, W
+
+PIVOT = 1e-9
+"""Of a diagonal entry: a pivot below it is none, and the diagonal stands for it. Without that, heavy upright
+five-segment robots ended in NaN one step after an impact (BDF2 and generalized-alpha at 1 ms)."""
+
+
+@kernel
+def factor(m: LaneMatrix, replaced: Lanes) -> None:
+    """L of M = L L^T in place of the lower triangle, the inverse of its diagonal on the diagonal; `replaced`
+    (1,) counts the pivots for which a diagonal entry had to stand."""
+    a, n = m.entries, m.n_columns
+    row = n * W
+    for w in range(W):
+        replaced[w] = 0.0
+    for j in range(n):
+        pivot = a[j * row + j * W : j * row + (j + 1) * W]
+        for w in range(W):
+            left = pivot[w]
+            for k in range(j):
+                left -= a[j * row + k * W + w] * a[j * row + k * W + w]
+            bad = not left > PIVOT * abs(pivot[w])
+            replaced[w] += 1.0 if bad else 0.0
+            pivot[w] = 1.0 / math.sqrt(max(abs(pivot[w]), 1e-300) if bad else left)
+        for i in range(j + 1, n):
+            to = a[i * row + j * W : i * row + (j + 1) * W]
+            for k in range(j):
+                left_k, right_k = a[i * row + k * W :], a[j * row + k * W :]
+                for w in range(W):
+                    to[w] -= left_k[w] * right_k[w]
+            for w in range(W):
+                to[w] *= pivot[w]
+
+
+@kernel
+def solve(m: LaneMatrix, x: Lanes) -> None:
+    """x = M^-1 x, M by `factor`."""
+    a, n = m.entries, m.n_columns
+    row = n * W
+    for i in range(n):
+        to = x[i * W : (i + 1) * W]
+        for k in range(i):
+            left, right = a[i * row + k * W :], x[k * W :]
+            for w in range(W):
+                to[w] -= left[w] * right[w]
+        for w in range(W):
+            to[w] *= a[i * row + i * W + w]
+    for step in range(n):
+        i = n - 1 - step
+        to = x[i * W : (i + 1) * W]
+        for k in range(i + 1, n):
+            left, right = a[k * row + i * W :], x[k * W :]
+            for w in range(W):
+                to[w] -= left[w] * right[w]
+        for w in range(W):
+            to[w] *= a[i * row + i * W + w]

@@ -1,0 +1,143 @@
+"""The rod of modes, LANES robots side by side: its buffers by name.
+
+A robot is a chain of pieces (a segment is one, or several where loads make kinks in its curvature). A buffer
+of fields is one-dimensional (`lanes`); the offsets below name its fields.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ...jit import inline
+from ..lanes import LaneMatrix, Lanes, W
+
+# node: rotation, position, tangent t = R v, force and moment that it must be given, force that its tangent
+# carries into the positions beyond, moment t x N + C
+N_R, N_POS, N_T, N_F, N_C, N_N, N_MU, NODE = 0, 9, 12, 15, 18, 21, 24, 27
+# given at a node: what its inertia is counted from, position and directors (`motion`), the line force
+# there, and the masses of the directors that stand for its rotary inertia [kg m^2]
+H_POS, H_D, H_LINE, H_J, HISTORY = 0, 3, 12, 15, 18
+# interval: u and v at its two Gauss points, rotation vector, W (rotation at its end, world, by each component
+# of u there), the moment that it carries, its own second derivatives (6x6, lower triangle), W . Y of a
+# column; given: u* at the Gauss points, how far K is there from that of the piece, and what the rate of
+# u - u* is counted from
+I_U, I_V, I_O, I_W, I_M, I_LOCAL, I_WORK, I_STAR, I_DK, I_HISTORY = 0, 6, 12, 15, 33, 36, 57, 63, 69, 75
+INTERVAL = 81
+# piece: length; EI_x, EI_y, GJ, then GA_x, GA_y, EA; damping time; mass per length; 1 where K changes along
+# the segments of the batch
+P_L, P_K, P_TAU, P_RHO, P_UNEVEN, PIECE = 0, 1, 7, 8, 9, 10
+# what is beyond a piece, about its end: force and moment; inertia's mass, first moment, and the moment by a
+# rotation (3, 3)
+B_F, B_M, B_MASS, B_FIRST, B_BACK, BEYOND = 0, 3, 6, 7, 10, 19
+# column: rotation of a node and change of its tangent by one unknown
+C_TH, C_V, COLUMN = 0, 3, 6
+# station: a lump or a point force between the nodes. Mass, force that it must be given, what its inertia is
+# counted from, force from outside; its row of the integration follows
+S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
+# Newton: energies of the trial and before it, damping, size of the step [rad], fraction of it, flags, and the
+# tip's rotation before it
+L_ENERGY, L_BEFORE, L_SIGMA, L_CORRECTION, L_STEP, L_DONE, L_REPLACED, L_ROTATION = 0, 1, 2, 3, 4, 5, 6, 7
+NEWTON = 16
+
+
+class ModalWork(NamedTuple):
+    """The buffers of a chunk of robots."""
+
+    node: Lanes
+    """(n_pieces, N + 1, NODE)"""
+    history: Lanes
+    """(n_pieces, N + 1, HISTORY)"""
+    interval: Lanes
+    """(n_pieces, N, INTERVAL)"""
+    column: Lanes
+    """(n_pieces, n_modes, N + 1, COLUMN)"""
+    end: Lanes
+    """(n_pieces, n_modes, 6) motion of a piece's end by each of its modes: displacement, rotation."""
+    station: Lanes
+    """(n_pieces, n_stations, S_ROW + N + 1)"""
+    piece: Lanes
+    """(n_pieces, PIECE)"""
+    beyond: Lanes
+    """(2, BEYOND) beyond the piece at work, and beyond the one before it."""
+    force: Lanes
+    """(N + 1, 3) change of N_N by a column."""
+    rigid: Lanes
+    """(N + 1, COLUMN) a rotation of the whole piece."""
+    coupling: Lanes
+    """(n_modes, 6) work of a displacement and a rotation of the piece's start on each of its modes."""
+    q: Lanes
+    """(n_q,) unknowns, piece after piece."""
+    q_history: Lanes
+    """(n_q,) what their rates are counted from."""
+    gradient: Lanes
+    """(n_q,)"""
+    hessian: Lanes
+    """(n_q, n_q) lower triangle (`hessian`)."""
+    offset: Lanes
+    """(n_pieces, n_tendons, 2) position of the tendons in each piece [m]."""
+    tension: Lanes
+    """(n_tendons,)"""
+    stiffness: Lanes
+    """(n_tendons,) 1 / compliance; 0 where a tendon is slack, or its tension is commanded."""
+    path_length: Lanes
+    """(n_tendons,)"""
+    path_change: Lanes
+    """(n_tendons, n_q) its derivatives (`path_change`)."""
+    scratch: Lanes
+    """(21,) sums of one Gauss point."""
+    outside: Lanes
+    """(15,) force and moment on the tip, the gravity of lumps; the tip force that keeps its direction, and
+    the one that follows the tip, material."""
+    follow: Lanes
+    """(3, n_q) answer of the unknowns to a force on the tip (`follower`)."""
+    scheme: Lanes
+    """(2,) alpha [1/s^2] and g [1/s] of the time scheme; 0 at rest."""
+    newton: Lanes
+    """(NEWTON,)"""
+    base: Lanes
+    """(12,) rotation and position of the base."""
+
+
+@inline
+def hessian(work: ModalWork) -> LaneMatrix:
+    """By rows and columns."""
+    return LaneMatrix(work.hessian, len(work.q) // W)
+
+
+@inline
+def path_change(work: ModalWork) -> LaneMatrix:
+    """By tendons and unknowns."""
+    return LaneMatrix(work.path_change, len(work.q) // W)
+
+
+@inline
+def one_task(work: ModalWork, i: int) -> ModalWork:
+    """The buffers of task i; `work` has one axis more at first."""
+    return ModalWork(
+        work.node[i],
+        work.history[i],
+        work.interval[i],
+        work.column[i],
+        work.end[i],
+        work.station[i],
+        work.piece[i],
+        work.beyond[i],
+        work.force[i],
+        work.rigid[i],
+        work.coupling[i],
+        work.q[i],
+        work.q_history[i],
+        work.gradient[i],
+        work.hessian[i],
+        work.offset[i],
+        work.tension[i],
+        work.stiffness[i],
+        work.path_length[i],
+        work.path_change[i],
+        work.scratch[i],
+        work.outside[i],
+        work.follow[i],
+        work.scheme[i],
+        work.newton[i],
+        work.base[i],
+    )

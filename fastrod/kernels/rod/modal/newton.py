@@ -1,0 +1,190 @@
+"""Newton's method on the energy, LANES robots side by side, each with a step and a damping of its own.
+
+A robot whose energy would rise, or whose Hessian has a negative pivot, is damped by sigma D with D the
+elasticity: an implicit step of the gradient flow in the metric of the elasticity, which is pseudo-transient
+continuation (Kelley and Keyes 1998) and ends at a stable equilibrium.
+"""
+
+from __future__ import annotations
+
+from fastrod.types import Floats, Ints
+
+from ...jit import inline, kernel
+from ...vec import Vec, dot
+from ..lanes import W, at, get, get_mat, put_mat, read, write, write_at
+from .assembly import assemble
+from .cholesky import factor, solve
+from .energy import energy_of_shape
+from .fields import (
+    L_BEFORE,
+    L_CORRECTION,
+    L_DONE,
+    L_ENERGY,
+    L_REPLACED,
+    L_ROTATION,
+    L_SIGMA,
+    L_STEP,
+    N_R,
+    P_K,
+    P_L,
+    ModalWork,
+    hessian,
+)
+from .follower import correct_step, follow_tip
+from .modes import ModalBasis
+from .sweep import sweep_piece
+from .tendons import tendon_paths, tensions
+
+SMALLEST_SIGMA, FIRST_SIGMA, LARGEST_SIGMA = 1e-4, 0.1, 1e8
+LONGEST_STEP = 1.0
+"""Change of a piece's bend, of one mode [rad], or of strain by a fifth of it."""
+ROUNDING = 1e-12
+"""Of the energies: below it a rise is none."""
+
+
+@kernel
+def sweep(b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork, with_columns: bool) -> None:
+    """Shape, paths and tensions of q. `command` (4, n_tendons * LANES): `tensions`."""
+    for p in range(work.piece.shape[0]):
+        sweep_piece(p, b, work, with_columns)
+    tendon_paths(b, first_tendon, work, with_columns)
+    tensions(command[0], command[1], command[2], command[3], work)
+
+
+@kernel
+def add_damping(b: ModalBasis, work: ModalWork) -> None:
+    """Add sigma D to the Hessian."""
+    n_modes = b.component.shape[0]
+    for p in range(work.piece.shape[0]):
+        for a in range(n_modes):
+            row, gram = p * n_modes + a, 1.0 / (2.0 * b.degree[a] + 1.0)
+            for w in range(W):
+                k = gram * read(work.piece[p], P_L, w) * read(work.piece[p], P_K + b.component[a], w)
+                k *= read(work.newton, L_SIGMA, w)
+                write_at(hessian(work), row, row, w, at(hessian(work), row, row, w) + k)
+
+
+@kernel
+def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
+    """Size [rad] of the Newton step in `work.gradient`, and the fraction of it that is taken: no longer than
+    LONGEST_STEP, none where the Hessian had a negative pivot or the robot is done. Whether every robot's is
+    undamped and smaller than `tolerance`: its energy need not be looked at."""
+    n_modes, newton, every = b.component.shape[0], work.newton, True
+    for w in range(W):
+        write(newton, L_CORRECTION, w, 0.0)
+    for p in range(work.piece.shape[0]):
+        for a in range(n_modes):
+            row, strain = p * n_modes + a, b.component[a] >= 3
+            for w in range(W):
+                unit = 5.0 if strain else read(work.piece[p], P_L, w)
+                size, largest = unit * abs(read(work.gradient, row, w)), read(newton, L_CORRECTION, w)
+                write(newton, L_CORRECTION, w, largest if size <= largest else size)  # NaN wins
+    for w in range(W):
+        size, done = read(newton, L_CORRECTION, w), read(newton, L_DONE, w) > 0.0
+        if not size < 1e300:  # also where it is no number
+            write(newton, L_REPLACED, w, 1.0)
+        replaced = read(newton, L_REPLACED, w) > 0.0
+        write(newton, L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
+        every = every and (done or (size < tolerance and not replaced and read(newton, L_SIGMA, w) == 0.0))
+    return every
+
+
+@kernel
+def take_step(work: ModalWork) -> None:
+    """q -= the fraction of the step."""
+    for a in range(len(work.q) // W):
+        for w in range(W):
+            fraction = read(work.newton, L_STEP, w)
+            step = fraction * read(work.gradient, a, w) if fraction > 0.0 else 0.0
+            write(work.gradient, a, w, step)
+            write(work.q, a, w, read(work.q, a, w) - step)
+
+
+@inline
+def rotation_between(after: tuple[float, ...], before: tuple[float, ...]) -> Vec:
+    """Rotation vector from one rotation to another that is near, world."""
+    a, b = after, before
+    x = a[6] * b[3] + a[7] * b[4] + a[8] * b[5] - a[3] * b[6] - a[4] * b[7] - a[5] * b[8]
+    y = a[0] * b[6] + a[1] * b[7] + a[2] * b[8] - a[6] * b[0] - a[7] * b[1] - a[8] * b[2]
+    z = a[3] * b[0] + a[4] * b[1] + a[5] * b[2] - a[0] * b[3] - a[1] * b[4] - a[2] * b[5]
+    return 0.5 * x, 0.5 * y, 0.5 * z
+
+
+@kernel
+def accept_step(work: ModalWork, tip: int, tolerance: float) -> int:
+    """Keep or undo the step of every robot, and change its damping; how many are not done. A moment on the
+    tip has no energy: its work along the step counts in its place.
+
+    A robot is done where an undamped step changed no bend by more than `tolerance` [rad], 0 for none yet."""
+    newton, left = work.newton, 0
+    for w in range(W):
+        energy, before = read(newton, L_ENERGY, w), read(newton, L_BEFORE, w)
+        turned = rotation_between(get_mat(work.node[-1, tip], N_R, w), get_mat(newton, L_ROTATION, w))
+        energy -= dot(get(work.outside, 3, w), turned)
+        sigma, size = read(newton, L_SIGMA, w), read(newton, L_CORRECTION, w)
+        follower = get(work.outside, 12, w)
+        # the energy of a force that follows the tip is not the same after the step
+        small = size * read(newton, L_STEP, w) < 1e-6
+        small = small or (size < LONGEST_STEP and dot(follower, follower) > 0.0)
+        lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
+        if read(newton, L_DONE, w) > 0.0:
+            continue
+        if read(newton, L_REPLACED, w) > 0.0 or not lower:
+            write(newton, L_SIGMA, w, min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA))
+            for a in range(len(work.q) // W):
+                write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
+            left += 1
+            continue
+        write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
+        put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
+        write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0)
+        if sigma == 0.0 and size < tolerance:
+            write(newton, L_DONE, w, 1.0)
+        else:
+            left += 1
+    return left
+
+
+@kernel
+def minimise(
+    b: ModalBasis,
+    first_tendon: Ints,
+    command: Floats,
+    work: ModalWork,
+    tolerance: float,
+    least: int,
+    most: int,
+) -> int:
+    """Iterate until every robot's last step was smaller than `tolerance` [rad], at least `least` and at most
+    `most` times; how many steps were taken. Ends with the shape at q."""
+    newton, tip, known = work.newton, b.width.shape[0], False
+    for w in range(W):
+        write(newton, L_SIGMA, w, 0.0)
+        write(newton, L_DONE, w, 0.0)
+    for i in range(most):
+        sweep(b, first_tendon, command, work, True)
+        follows = follow_tip(work)
+        assemble(b, first_tendon, work)
+        add_damping(b, work)
+        factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 1) * W])
+        solve(hessian(work), work.gradient)
+        if follows:
+            correct_step(work)
+        small = measure_step(b, work, tolerance)
+        if not small and (follows or not known):
+            energy_of_shape(b, command, work, newton[L_BEFORE * W : (L_BEFORE + 1) * W])
+            for w in range(W):
+                put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
+        take_step(work)
+        sweep(b, first_tendon, command, work, False)
+        enough, known = i + 1 >= least, not small
+        if small and enough:
+            for w in range(W):
+                write(newton, L_DONE, w, 1.0)
+            return i + 1
+        if not small:
+            energy_of_shape(b, command, work, newton[L_ENERGY * W : (L_ENERGY + 1) * W])
+            if accept_step(work, tip, tolerance if enough else 0.0) == 0:
+                return i + 1
+    sweep(b, first_tendon, command, work, False)  # a last step may have been undone
+    return most

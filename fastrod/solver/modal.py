@@ -1,0 +1,362 @@
+"""`ModalSolver`: robots as curvature modes, at rest or in motion."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from fastrod.errors import InputError, nearest, shown
+from fastrod.kernels.batch import derive_modes, pass_modes
+from fastrod.kernels.jit import LANES
+from fastrod.kernels.rod.modal.chunk import ModalRun
+from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
+from fastrod.kernels.rod.modal.fields import ModalWork
+from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints
+from fastrod.kernels.rod.modal.modes import (
+    N_INTERVALS,
+    ModalBasis,
+    gauss_points,
+    hat_row,
+    integral_row,
+    interval_of,
+    lagrange_row,
+    legendre_at,
+    modal_basis,
+)
+from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
+from fastrod.kernels.rod.modal.output import ModalOutput, ModalSamples, MotionShape
+from fastrod.kernels.rod.modal.workspace import modal_workspace
+from fastrod.model.robot import Robot
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
+
+SchemeName: TypeAlias = Literal["bdf1", "bdf2", "generalized_alpha"]
+SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
+_SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
+_NEARLY = 0.05  # rad: a Newton step of this size leaves an error of its square
+_MOST = 200
+
+
+@cache
+def _pool(n_threads: int) -> ThreadPoolExecutor:
+    """Threads that run one kernel, which holds no lock of Python: for `prange` it would be compiled twice."""
+    return ThreadPoolExecutor(n_threads)
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+class Modes(NamedTuple):
+    """How finely the rod is resolved: modes of a piece, and pieces of a segment."""
+
+    bending: int = 5
+    """Of the curvature about d1, and about d2."""
+    torsion: int = 3
+    strain: int = 2
+    """Of the stretch, and of each shear, where a segment has a stiffness for it."""
+    pieces: int = 1
+
+
+class Step(NamedTuple):
+    """How a step in time is taken."""
+
+    scheme: int
+    dt: float
+    rho: float = 0.5
+    """Spectral radius of generalized-alpha at infinite frequency."""
+    passes: int = 1
+    """Newton steps at least; more where the last one was large."""
+
+
+def scheme_of(name: str, rho: float) -> int:
+    """The number of a scheme. Raises `InputError` for one that there is not, or a rho that is none."""
+    if not isinstance(name, str) or name not in SCHEMES:
+        raise InputError(f"scheme is {shown(name)}; {nearest(str(name), SCHEMES)}")
+    if not isinstance(rho, (int, float, np.floating, np.integer)) or not 0.0 <= rho <= 0.9:
+        raise InputError(
+            f"rho is {shown(rho)}; give a number from 0 (strongest damping of high frequencies) to 0.9: "
+            "beyond, sudden loads grow."
+        )
+    return SCHEMES[name]
+
+
+def modal_samples(n_segments: int, n_steps: int, per_segment: int, n_degrees: int) -> ModalSamples:
+    """Cross-sections at `n_steps` even places of each segment, and the tip."""
+    s = np.arange(n_segments * n_steps + 1) / n_steps
+    piece = np.minimum((s * per_segment + 1e-9).astype(np.int64), n_segments * per_segment - 1)
+    x = s * per_segment - piece
+    interval, width = interval_of(x)
+    gauss = gauss_points(interval, width)
+    inside = (piece % per_segment)[:, None] + np.concatenate([gauss, x[:, None]], axis=1)
+    return ModalSamples(
+        piece=piece,
+        interval=interval,
+        width=width,
+        at_gauss=legendre_at(gauss, n_degrees),
+        here=legendre_at(x, n_degrees),
+        place=inside / per_segment,
+        row=integral_row(x),
+        lagrange=lagrange_row(x),
+    )
+
+
+def basis_of(robots: Sequence[Robot], modes: Modes) -> ModalBasis:
+    """Modes of bend and torsion; of stretch and shear where any segment has a stiffness for them."""
+    segments = [segment for robot in robots for segment in robot.segments]
+    shears, stretches = (
+        any(np.isfinite(getattr(segment, f"{name}_stiffness")) for segment in segments)
+        for name in ("shear", "axial")
+    )
+    return modal_basis(
+        modes.bending, modes.torsion, modes.strain if shears else 0, modes.strain if stretches else 0
+    )
+
+
+_RIGID = 1e12  # N: of a segment that does not stretch or shear in a batch where others do
+
+
+def cut(robots: Sequence[Robot], layout: Layout, per_segment: int) -> ModalPieces:
+    """The segments of a batch in pieces of even length; a single robot stands for all."""
+    n_segments = len(layout.first_tendon)
+    segment = np.repeat(np.arange(n_segments), per_segment)
+    start = np.tile(np.arange(per_segment) / per_segment, n_segments)
+    rows = [[_inertia(s.line_density, s.body_radius) for s in robot.segments] for robot in robots]
+    axial = [
+        [(s.shear_stiffness, s.shear_stiffness, s.axial_stiffness) for s in robot.segments]
+        for robot in robots
+    ]
+    places = [(k, lump.at / s.length) for k, s in enumerate(robots[0].segments) for lump in s.lumps]
+    lumps = [[lump.mass for s in robot.segments for lump in s.lumps] for robot in robots]
+    piece = np.array([k * per_segment + min(int(x * per_segment), per_segment - 1) for k, x in places], int)
+    station = np.array([int((piece[:i] == p).sum()) for i, p in enumerate(piece)], int)
+    local = np.array(
+        [
+            [
+                lump.at / s.length * per_segment - piece[i] % per_segment
+                for i, (s, lump) in enumerate((s, lump) for s in robot.segments for lump in s.lumps)
+            ]
+            for robot in robots
+        ]
+    )
+    return ModalPieces(
+        segment=segment,
+        first_tendon=layout.first_tendon[segment],
+        bound=np.stack([start, start + 1.0 / per_segment], axis=1),
+        density=np.array(rows),
+        axial=np.minimum(np.array(axial, dtype=np.float64), _RIGID),
+        damping_time=np.array([[s.damping_time for s in robot.segments] for robot in robots], float),
+        lump=np.array(lumps, dtype=np.float64).reshape(len(robots), len(places)),
+        lump_spin=_directors(robots).reshape(len(robots), len(places), 3),
+        lump_weight=hat_row(local.reshape(len(robots), len(places))),
+        lump_piece=piece.astype(np.int64),
+        lump_station=station.astype(np.int64),
+        lump_row=integral_row(local.reshape(len(robots), len(places))),
+        gravity=np.array([robot.gravity for robot in robots], dtype=np.float64),
+    )
+
+
+def _directors(robots: Sequence[Robot]) -> Floats:
+    """(n_robots, n_lumps, 3) masses at the ends of d1, d2 and d3 that have the inertia of each lump:
+    I_1 = J_2 + J_3 and so on."""
+    inertia = np.array([[lump.inertia for s in robot.segments for lump in s.lumps] for robot in robots])
+    inertia = inertia.reshape(len(robots), -1, 3)
+    return np.asarray(0.5 * inertia.sum(2, keepdims=True) - inertia)
+
+
+def _inertia(density: float, radius: float) -> tuple[float, float, float]:
+    """Mass per length, and its second moments of a round cross-section about d2 and d1."""
+    rotary = 0.25 * density * radius * radius
+    return density, rotary, rotary
+
+
+def no_points(n_robots: int) -> ModalPoints:
+    """No point force."""
+    n_nodes = N_INTERVALS + 1
+    zeros = np.zeros((n_robots, 0), np.int64), np.zeros((n_robots, 0, n_nodes)), np.zeros((n_robots, 0, 3))
+    return ModalPoints(*zeros)
+
+
+class ModalSolver:
+    """Robots of one layout as modes. `params` is replaced where effects change a robot's numbers."""
+
+    def __init__(
+        self,
+        robots: Sequence[Robot],
+        layout: Layout,
+        params: Params,
+        n_robots: int,
+        threads: int,
+        modes: Modes,
+    ) -> None:
+        self.layout, self.params, self.n_robots, self.threads = layout, params, n_robots, threads
+        self.basis, self.modes = basis_of(robots, modes), modes
+        self.pieces = cut(robots, layout, modes.pieces)
+        self.gravity = self.pieces.gravity  # of the robots, where none is given
+        n_pieces, n = len(self.pieces.segment), len(self.basis.width)
+        counts = np.bincount(self.pieces.lump_piece, minlength=n_pieces)
+        self._sizes = n_pieces, len(layout.tendon_segment), int(counts.max(initial=0))
+        self.samples = modal_samples(
+            len(layout.first_tendon), layout.n_steps, modes.pieces, self.basis.at_node.shape[1]
+        )
+        n_q = n_pieces * len(self.basis.component)
+        numbers = n_pieces * ((n + 1) * NODE_VECTORS + 3 * self._sizes[2])
+        self.motion = ModalMotion(
+            *(np.zeros((n_robots, n_q)) for _ in range(3)), *(np.zeros((n_robots, numbers)) for _ in range(4))
+        )
+        self.iterations = np.zeros(n_robots, np.int64)
+        self.points = no_points(n_robots)
+        self._work: tuple[tuple[int, int], ModalWork] | None = None
+
+    @property
+    def n_points(self) -> int:
+        """Cross-sections of a shape."""
+        return len(self.samples.piece)
+
+    def replace(self, robots: Sequence[Robot]) -> None:
+        """These robots in place of the present ones, of the same layout."""
+        self.pieces = cut(robots, self.layout, self.modes.pieces)
+        self.gravity = self.pieces.gravity
+
+    def start_straight(self, rows: Ints) -> None:
+        """Let these robots begin from their shape without loads."""
+        for array in self.motion:
+            array[rows] = 0.0
+
+    def settle(
+        self, rows: Ints, ports: Ports, shape: RodShape, moving: MotionShape, tolerance: float, scheme: int
+    ) -> Flags:
+        """Bring these robots to rest from where they are; who arrived. `tolerance` [m] at the tip."""
+        bend = tolerance / float(np.max(self.params.rod_length))
+        self._run(rows, ports, shape, moving, Step(REST, 1.0), None, (max(bend, 1e-13), 2, _MOST), scheme)
+        return np.asarray(self.iterations[rows] > 0)
+
+    def step(
+        self, rows: Ints, ports: Ports, shape: RodShape, moving: MotionShape, how: Step, jump: Floats
+    ) -> Flags:
+        """Move these robots on by dt; whose Newton's method ended. `jump` (n_robots,): 1 where the inputs
+        are not those that the last motion was leading to."""
+        self._run(rows, ports, shape, moving, how, jump, (_NEARLY, how.passes, _MOST), how.scheme)
+        return np.asarray(self.iterations[rows] > 0)
+
+    def _run(
+        self,
+        rows: Ints,
+        ports: Ports,
+        shape: RodShape,
+        moving: MotionShape,
+        how: Step,
+        jump: Floats | None,
+        effort: tuple[float, int, int],
+        remembers: int,
+    ) -> None:
+        chunks = -(-len(rows) // LANES)
+        tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
+        each = LANES * -(-chunks // tasks)
+        batch = ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, self.motion)
+        output, work = ModalOutput(self.samples, shape, moving), self._workspace(tasks)
+
+        def run_some(task: int) -> None:
+            some = rows[task * each : (task + 1) * each]
+            run = self._run_of(some, how, jump, effort, remembers)
+            pass_modes(run, batch, output, ModalWork(*(room[task : task + 1] for room in work)))
+
+        if tasks == 1:
+            run_some(0)
+        else:
+            list(_pool(tasks).map(run_some, range(tasks)))
+
+    def _run_of(
+        self, rows: Ints, how: Step, jump: Floats | None, effort: tuple[float, int, int], remembers: int
+    ) -> ModalRun:
+        return ModalRun(
+            rows,
+            np.zeros(self.n_robots) if jump is None else jump,
+            np.zeros((1, 4, self._sizes[1] * LANES)),
+            np.zeros((1, 2, LANES)),
+            self.iterations,
+            how.scheme,
+            float(how.dt),
+            float(how.rho),
+            *effort,
+            remembers,
+        )
+
+    def derive(
+        self,
+        rows: Ints,
+        ports: Ports,
+        unknowns: Floats | None = None,
+        *,
+        wanted: Collection[str] = ("hessian", "mass"),
+        step: tuple[ModalMotion, Step, Floats] | None = None,
+    ) -> ModalDerivatives:
+        """Derivatives of these robots at their unknowns or at `unknowns` (n_robots, n_q), zeros for the
+        others: at rest, or in a `step` from a motion with its `jump` (`step`). `wanted` names the matrices:
+        hessian, mass (at rest), damping (in a step), number for the last three."""
+        n, motion = self.n_robots, self.motion if step is None else step[0]
+        q = motion.q if unknowns is None else unknowns
+        n_q, m = q.shape[1], motion.place.shape[1]
+        shapes = {
+            "gradient": (n_q,),
+            "hessian": (n_q, n_q),
+            "mass": (n_q, n_q),
+            "tip": (6, n_q),
+            "position": (3,),
+            "rotation": (3, 3),
+            "force": (3,),
+            "damping": (n_q, n_q),
+            "number": (m,),
+            "number_change": (m, n_q),
+            "inertia": (m,),
+        }
+        left_out = {"hessian", "mass", "damping", "number"} - set(wanted)
+        if "number" in left_out:
+            left_out |= {"number_change", "inertia"}
+        found = ModalDerivatives(
+            *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
+        )
+        how, jump = (Step(REST, 1.0), None) if step is None else step[1:]
+        run = self._run_of(rows, how, jump, (0.0, 1, 1), REST)
+        batch = ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, motion)
+        derive_modes(run, batch, q, self._workspace(1), found)
+        return found
+
+    def _workspace(self, tasks: int) -> ModalWork:
+        """Kept: to make one takes as long as a step of one robot."""
+        n_pieces, n_tendons, n_lumps = self._sizes
+        size = tasks, n_lumps + self.points.piece.shape[1]
+        if self._work is None or self._work[0] != size:
+            self._work = size, modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
+        return self._work[1]
+
+    def place_points(self, arclength: Floats, force: Floats, extension: Floats) -> None:
+        """Point forces (1 or n_robots, n_points, 3) [N] at arclengths (1 or n_robots, n_points) [m]."""
+        n, m = self.n_robots, arclength.shape[1]
+        if not m:
+            self.points = no_points(n)
+            return
+        ends = np.cumsum(self.params.length + extension, axis=1)
+        ends = np.broadcast_to(ends, (n, ends.shape[1]))
+        s = np.broadcast_to(arclength, (n, m))
+        segment = (s[:, :, None] > ends[:, None, :-1]).sum(2)
+        starts = np.concatenate([np.zeros((n, 1)), ends], axis=1)
+        first, last = (np.take_along_axis(starts, segment + k, 1) for k in range(2))
+        per = len(self.pieces.segment) // ends.shape[1]
+        x = np.clip((s - first) / (last - first), 0.0, 1.0) * per
+        inside = np.minimum(x.astype(np.int64), per - 1)
+        self.points = ModalPoints(
+            np.ascontiguousarray(segment * per + inside),
+            integral_row(x - inside),
+            np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
+        )
+
+    def new_motion_shape(self, outputs: Literal["full", "tip"]) -> MotionShape:
+        """Room for what a pass writes of the motion."""
+        n = self.n_robots
+        along = np.full((n if outputs == "full" else 0, self.n_points, 3), np.nan)
+        return MotionShape(along, along.copy(), np.full(n, np.nan), np.full(n, np.nan))

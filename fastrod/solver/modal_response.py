@@ -1,0 +1,119 @@
+"""Linear response of rods of modes: how the tip answers inputs and forces, and how they ring."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
+from fastrod.solver.modal import ModalSolver
+from fastrod.solver.response import ROTATIONS, Relocate, rotation_differences
+from fastrod.types import Floats, Ints, Ports
+
+_STEP = 1e-4
+"""Of a length or a force, at fixed unknowns: the error of a central difference is of its square, and of
+rounding over it, some 1e-9 both."""
+
+
+@dataclass(frozen=True)
+class ModalLinear:
+    """Robots `rows` near their last shape, inertia aside. A robot whose shape is no rest answers as one that
+    is held there."""
+
+    modal: ModalSolver
+    rows: Ints
+    ports: Ports
+    points: tuple[Floats, Floats]
+    """Point forces at their arclengths: (n_robots, m) [m] and (n_robots, m, 3) [N]."""
+
+    def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
+        """(n_robots, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that
+        is the mode), then by extensions; with `turning` three columns more, by the rotation vector of the
+        base, world. `relocate` returns what an extension moves besides itself."""
+        layout, params = self.modal.layout, self.modal.params
+        held = set(layout.free_tendon.tolist())
+        length, force = float(np.max(params.rod_length)), float(np.max(params.tension_scale))
+        inputs = [
+            ("tendon_length", t, length) if t in held else ("tension", t, force)
+            for t in range(len(layout.tendon_segment))
+        ]
+        inputs += [("extension", k, length) for k in range(len(layout.first_tendon))]
+        columns = [self._by_port(name, k, _STEP * size, relocate) for name, k, size in inputs]
+        columns += [self._by_rotation(k) for k in range(3 if turning else 0)]
+        return self._close(np.stack([c[0] for c in columns], 2), np.stack([c[1] for c in columns], 2))
+
+    def by_force(self) -> Floats:
+        """(n_robots, 6, 3) change of the tip per tip force."""
+        moved = np.swapaxes(self.modal.derive(self.rows, self.ports, wanted=()).tip[:, :3], 1, 2)
+        return self._close(np.zeros((len(moved), 6, 3)), -moved)
+
+    def _close(self, tip: Floats, gradient: Floats) -> Floats:
+        """(n_robots, 6, m) of the changes (n_robots, 6, m) and (n_robots, n_q, m) at fixed unknowns."""
+        found = self.modal.derive(self.rows, self.ports)
+        answer = np.full(tip.shape, np.nan)
+        some = self.rows
+        moved = np.linalg.solve(stiffness(found)[some], gradient[some])
+        answer[some] = tip[some] - found.tip[some] @ moved
+        return answer
+
+    def _by_port(
+        self, name: str, column: int, delta: float, relocate: Relocate | None
+    ) -> tuple[Floats, Floats]:
+        port = getattr(self.ports, name)
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = port.copy()
+            moved[:, column] += sign * delta
+            more: dict[str, Any] = {name: moved}
+            if name == "extension":
+                self.modal.place_points(*self.points, moved)
+                more |= {} if relocate is None else dict(relocate(moved))
+            sides.append(self.modal.derive(self.rows, self.ports._replace(**more), wanted=()))
+        if name == "extension":
+            self.modal.place_points(*self.points, self.ports.extension)
+        return _difference(sides, delta)
+
+    def _by_rotation(self, axis: int) -> tuple[Floats, Floats]:
+        sides = []
+        for rotation in ROTATIONS[2 * axis : 2 * axis + 2, 0]:
+            pose = self.ports.base_pose.copy()
+            pose[:, 3:] = pose[:, 3:] @ rotation.T / math.sqrt(1.0 + 0.25e-8)
+            sides.append(self.modal.derive(self.rows, self.ports._replace(base_pose=pose), wanted=()))
+        return _difference(sides, 1e-4)
+
+    def frequencies(self, count: int) -> Floats:
+        """(n_robots, count) lowest natural frequencies [Hz] of small motions about this shape, undamped; nan
+        where a robot would leave it."""
+        found = self.modal.derive(self.rows, self.ports)
+        answer = np.full((len(found.mass), count), np.nan)
+        for i in self.rows:
+            try:
+                lower = np.linalg.inv(np.linalg.cholesky(found.hessian[i]))
+            except np.linalg.LinAlgError:
+                continue
+            # 1 / w^2: the mass may be next to nothing in some direction, the stiffness is not
+            square = np.maximum(np.linalg.eigvalsh(lower @ found.mass[i] @ lower.T), 0.0)[::-1][:count]
+            with np.errstate(divide="ignore"):
+                answer[i, : len(square)] = 1.0 / (2.0 * math.pi * np.sqrt(square))
+        return answer
+
+
+def stiffness(found: ModalDerivatives) -> Floats:
+    """(n_robots, n_q, n_q) derivative of the gradient, with the rotation of a force that follows the tip."""
+    if not found.force.any():
+        return found.hessian
+    x, y, z = found.force.T
+    o = np.zeros_like(x)
+    across = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
+    return np.asarray(found.hessian + np.swapaxes(found.tip[:, :3], 1, 2) @ across @ found.tip[:, 3:])
+
+
+def _difference(sides: list[ModalDerivatives], delta: float) -> tuple[Floats, Floats]:
+    """(n_robots, 6) and (n_robots, n_q): change of tip and gradient, forward and back."""
+    ahead, behind = sides
+    turned = rotation_differences(ahead.rotation, behind.rotation)
+    tip = np.concatenate([ahead.position - behind.position, turned], axis=1)
+    return tip / (2.0 * delta), (ahead.gradient - behind.gradient) / (2.0 * delta)

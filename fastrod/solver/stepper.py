@@ -1,0 +1,185 @@
+"""`TimeStepper`: robots of modes brought to rest or moved on by dt, in shorter steps where one does not
+end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fastrod.contact.frames import blended
+from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, REST, ModalMotion
+from fastrod.kernels.rod.modal.output import MotionShape
+from fastrod.solver.modal import ModalSolver, Step
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
+
+_JUMP = 2.0
+"""A change of an input of more than so many times the one before is a jump: the acceleration after it is then
+measured first. A smooth beginning counts as one too, which costs a step and no accuracy."""
+_MOVING = (
+    "tendon_length",
+    "tension",
+    "extension",
+    "tip_force",
+    "tip_moment",
+    "follower_force",
+    "line_force",
+    "node_force",
+    "base_pose",
+)
+_LOADS = ("tension", "tip_force", "tip_moment", "follower_force", "line_force", "node_force")
+_RECORDED = 6  # Newton steps at least, of a step that is recorded
+_HALVINGS = 5  # of a step whose Newton's method does not end
+_FRACTIONS = np.linspace(0.125, 1.0, 8)  # of the load, where a robot does not come to rest at once
+
+
+class PassShapes(NamedTuple):
+    """What a pass writes."""
+
+    shape: RodShape
+    motion: MotionShape
+
+
+Note = Callable[[Ints, Ports, Step, bool, ModalMotion], None]
+"""Robots, their inputs, the step (REST: brought to rest), whether inputs had jumped, the motion before it."""
+
+
+class TimeStepper:
+    """Robots of modes in time. `time` is the step of dt; `change` (n_robots,) by how much each input changed
+    at the last one."""
+
+    def __init__(self, modal: ModalSolver, time: Step) -> None:
+        self.modal, self.time = modal, time
+        self.change: dict[str, Floats] = {}
+        self.note: Note | None = None
+        """Is called with what was solved; steps then go on until Newton's method ends."""
+        self.divided = False
+        """A step was taken in shorter ones."""
+
+    def rest(self, rows: Ints, cold: Ints, ports: Ports, found: PassShapes, tolerance: float) -> Flags:
+        """(n_rows,) who came to rest: from where they are, `cold` ones from straight, then under loads that
+        grow from none to all."""
+        modal, scheme = self.modal, self.time.scheme
+        modal.start_straight(cold)
+        ok = modal.settle(rows, ports, *found, tolerance, scheme)
+        if len(lost := rows[~ok]):
+            modal.start_straight(lost)
+            straight, arrived = unloaded(ports, modal.layout, modal.params), np.ones(len(lost), bool)
+            for fraction in _FRACTIONS:
+                some = blended(straight, ports, np.full(modal.n_robots, fraction))
+                arrived = modal.settle(lost, some, *found, tolerance, scheme)
+            ok[~ok] = arrived
+        for name, last in self.change.items():  # who is brought to rest has no change to go on from
+            self.change[name] = np.array(last)
+            self.change[name][rows] = 0.0
+        if self.note is not None:
+            self.note(rows[ok], ports, self.time._replace(scheme=REST), False, modal.motion)
+        return ok
+
+    def advance(self, rows: Ints, inputs: tuple[Ports, Ports], jump: Floats, found: PassShapes) -> Flags:
+        """(n_rows,) who moved on by dt: in one step, or where Newton's method does not end in shorter ones
+        along which the inputs change evenly, from those before to those now. `jump` (n_robots,): `jumps`."""
+        modal, how, note = self.modal, self.time, self.note
+        jumped = rows[jump[rows] > 0.0]
+        kept = _rows_of(modal.motion, jumped)
+        if note is not None:
+            how = how._replace(passes=max(how.passes, _RECORDED))
+            start = copied(modal.motion)
+        ok = modal.step(rows, inputs[1], *found, how, jump)
+        if note is not None:
+            for some, sudden in ((jump[rows] > 0.0, True), (jump[rows] <= 0.0, False)):
+                note(rows[ok & some], inputs[1], how, sudden, start)
+        self.divided = not ok.all()
+        for halving in range(1, _HALVINGS + 1):
+            if not len(lost := rows[~ok]):
+                break
+            for array, then in zip(modal.motion, kept, strict=True):
+                again = np.isin(jumped, lost)
+                array[jumped[again]] = then[again]
+            ok[~ok] = self._advance_in(2**halving, lost, inputs, np.ones(modal.n_robots), found)
+        return ok
+
+    def _advance_in(
+        self, n: int, rows: Ints, inputs: tuple[Ports, Ports], jump: Floats, found: PassShapes
+    ) -> Flags:
+        """(n_rows,) who moved on by dt in n steps, before the first of which inputs may `jump`; the others
+        are as they were."""
+        modal, scheme = self.modal, self.time.scheme
+        start = _rows_of(modal.motion, rows)
+        # BDF2 would need a step of the same length before
+        one = GENERALIZED_ALPHA if scheme == BDF2 else scheme
+        how, ok = self.time._replace(scheme=one, dt=self.time.dt / n), np.ones(len(rows), bool)
+        for k in range(n):
+            if not ok.any():
+                break
+            some = blended(*inputs, np.full(modal.n_robots, (k + 1) / n))
+            ok[ok] = modal.step(rows[ok], some, *found, how, jump if k == 0 else np.zeros_like(jump))
+        for name, array, then in zip(ModalMotion._fields, modal.motion, start, strict=True):
+            array[rows[~ok]] = then[~ok]
+            if scheme != GENERALIZED_ALPHA and name.endswith("_other"):
+                array[rows[ok]] = getattr(start, name.removesuffix("_other"))[ok]
+        return ok
+
+    def errors(
+        self,
+        rows: Ints,
+        inputs: tuple[Ports, Ports],
+        jump: Floats,
+        start: ModalMotion,
+        tip: Floats,
+        found: PassShapes,
+    ) -> Floats:
+        """(n_robots,) by how much the last step from `start`, which ended at `tip` (n_robots, 3), is off at
+        the tip [m], from where two halves of it end (Hairer, Norsett and Wanner 1993, II.4); nan but for
+        `rows`. `found` is room for a shape."""
+        motion, scheme, answer = self.modal.motion, self.time.scheme, np.full(len(tip), np.nan)
+        ended = copied(motion)
+        _put(motion, start, rows)
+        ok = self._advance_in(2, rows, inputs, np.ones_like(jump) if scheme == BDF2 else jump, found)
+        _put(motion, ended, rows)
+        apart = np.linalg.norm(tip[rows] - found.shape.tip_position[rows], axis=1)
+        # two halves leave half the error of the first order, a quarter of that of the second
+        left = {BDF1: 0.5, GENERALIZED_ALPHA: 0.25}.get(scheme, 0.0)
+        answer[rows[ok]] = apart[ok] / (1.0 - left)
+        return answer
+
+    def jumps(self, before: Ports, ports: Ports) -> Floats:
+        """(n_robots,) 1 where an input changes by more than its last change was leading to."""
+        n = self.modal.n_robots
+        jump, change = np.zeros(n), {}
+        for name in _MOVING:
+            now, then = getattr(ports, name), getattr(before, name)
+            if now is then:
+                continue
+            if then.shape[1:] != now.shape[1:] or not len(now) or not len(then):
+                if len(now) or len(then):
+                    jump[:] = 1.0
+                continue
+            step = np.abs(now - then).reshape(max(len(now), len(then)), -1).max(1, initial=0.0)
+            change[name] = np.broadcast_to(step, n)
+            last = self.change.get(name, np.zeros(n))
+            jump[(change[name] > _JUMP * last) & (change[name] > 0.0)] = 1.0
+        self.change = change
+        return jump
+
+
+def unloaded(ports: Ports, layout: Layout, params: Params) -> Ports:
+    """The straight robot on the same base, without loads."""
+    ends = np.cumsum(params.length + ports.extension, axis=1)[:, layout.tendon_segment]
+    zeros: dict[str, Any] = {name: 0.0 * getattr(ports, name) for name in _LOADS}
+    return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
+
+
+def copied(motion: ModalMotion) -> ModalMotion:
+    """The same numbers in arrays of their own."""
+    return ModalMotion(*(a.copy() for a in motion))
+
+
+def _rows_of(motion: ModalMotion, rows: Ints) -> ModalMotion:
+    return ModalMotion(*(a[rows] for a in motion))
+
+
+def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
+    for array, old in zip(motion, then, strict=True):
+        array[rows] = old[rows]

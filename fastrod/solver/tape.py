@@ -1,0 +1,314 @@
+"""`Tape`: how the tip's motion changes with inputs and with the robots' numbers, forward and adjoint.
+
+Every balance g(q, r~, q~, input) = 0 that the simulator solved gives, linearised at its solution,
+dq = - H^-1 (dg/dr~ dr~ + dg/dq~ dq~ + dg/dinput dinput), and the scheme the motion after it (`balances`).
+Forward columns follow the steps in order; the adjoint goes through them backward (Cao, Li, Petzold and Serban
+2003, for steps instead of a differential equation). Derivatives of g by inputs and numbers at fixed
+unknowns are central differences, of which the error is that of rounding for all that enters linearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import InputError, RobotError, nearest
+from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
+from fastrod.kernels.rod.modal.motion import NODE_VECTORS, ModalMotion
+from fastrod.model.compile import compile_robots
+from fastrod.model.numbers import number, with_number
+from fastrod.model.robot import Robot
+from fastrod.solver.balances import Balance, Event, at_solution, balances_of
+from fastrod.solver.inputs import Reader
+from fastrod.solver.modal import ModalSolver
+from fastrod.types import Floats, Ints
+
+_STEP = 2e-5  # of a length, a force or a number, for central differences
+
+
+class Tips(NamedTuple):
+    """Motion of the tip after every call, or what changes with it."""
+
+    position: Floats
+    """(n_calls, n_robots, 3) world [m]."""
+    rotation: Floats | None = None
+    """(n_calls, n_robots, 3, 3) world_from_material."""
+    velocity: Floats | None = None
+    """(n_calls, n_robots, 3) world [m/s]."""
+
+
+Cost: TypeAlias = Callable[[Tips], tuple[ArrayLike, Tips]]
+"""Tips -> the cost of every robot (n_robots,), and its derivatives by the tips' numbers, in arrays of their
+shapes; None where it does not depend on them."""
+
+
+class Gradient(NamedTuple):
+    """Derivatives of every robot's cost."""
+
+    value: Floats
+    """(n_robots,)"""
+    inputs: dict[str, Floats]
+    """By each input of each call: (n_calls, n_robots, ...)."""
+    parameters: dict[str, Floats]
+    """(n_robots,) by each number of the robot."""
+
+
+class Tape:
+    """Calls of a simulator of modes, and how their outcome changes.
+
+    With effects, inputs are those behind them: what the rod receives.
+    """
+
+    def __init__(self, robots: Sequence[Robot], modal: ModalSolver, first: int) -> None:
+        """`robots` one or n_robots; `first` is the scheme by which robots at rest begin to move."""
+        self.robots, self._modal, self._first = tuple(robots), modal, first
+        self._calls: list[list[Event]] = []
+        self._place: list[Floats] = []
+        self._velocity: list[Floats] = []
+        self.broken: str | None = None
+        """Why there are no derivatives."""
+        last = NODE_VECTORS * len(modal.pieces.segment) * len(modal.basis.node)
+        self._tip = slice(last - NODE_VECTORS, last)
+
+    def add(self, events: list[Event], motion: ModalMotion) -> None:
+        """A call, and the motion after it."""
+        self._calls.append(events)
+        self._place.append(motion.place[:, self._tip].copy())
+        self._velocity.append(motion.velocity[:, self._tip].copy())
+
+    def tips(self) -> Tips:
+        """What the simulator found. Raises `InputError` before the first call."""
+        self._check()
+        return _as_tips(np.stack(self._place), np.stack(self._velocity))
+
+    def forward(self, parameters: Sequence[str] = (), **directions: ArrayLike) -> Tips:
+        """Derivatives of the tips, with one axis more at their end: by each of these numbers of the robots
+        ("segment.1.line_density"), then along each direction, by how much an input of every call changes:
+        (n_calls, n_robots or 1, ...) as `step` takes it. Raises `InputError` for a name that there is not, a
+        wrong shape, and before the first call."""
+        self._check()
+        n, n_calls, m = self._modal.n_robots, len(self._calls), len(parameters) + len(directions)
+        inputs = [Input(self._modal, name) for name in directions]
+        along = [one.along(given, n_calls, n) for one, given in zip(inputs, directions.values(), strict=True)]
+        twins = [Twin(self.robots, self._modal, name) for name in parameters]
+        q = np.zeros((3, *self._modal.motion.q.shape, m))
+        place = np.zeros((4, *self._modal.motion.place.shape, m))
+        found = []
+        for k, events in enumerate(self._calls):
+            for event in events:
+                for balance in balances_of(self._modal, event, self._first):
+                    changes = [twin.change(event, balance) for twin in twins]
+                    changes += [
+                        one.change(self._modal, event, balance, steps[k])
+                        for one, steps in zip(inputs, along, strict=True)
+                    ]
+                    _propagate(balance, q, place, changes)
+            found.append(place[:2, :, self._tip].copy())
+        moved = np.stack(found)
+        return _as_tips(moved[:, 0], moved[:, 1])
+
+    def adjoint(self, cost: Cost, parameters: Sequence[str] = (), inputs: Sequence[str] = ()) -> Gradient:
+        """Derivatives of a cost of the tips' motion by these inputs of every call, and by these numbers of
+        the robots ("segment.1.line_density"), from one walk back through the calls. Raises `InputError` for a
+        name that there is not, derivatives of a wrong shape, and before the first call."""
+        modal, n = self._modal, self._modal.n_robots
+        value, by_place, by_velocity = self._cost(cost)
+        ports = [Input(modal, name) for name in inputs]
+        twins = [Twin(self.robots, modal, name) for name in parameters]
+        by_input = {one.name: np.zeros((len(self._calls), n, one.size)) for one in ports}
+        by_number = {name: np.zeros(n) for name in parameters}
+        q, place = np.zeros((3, *modal.motion.q.shape)), np.zeros((4, *modal.motion.place.shape))
+        for k in reversed(range(len(self._calls))):
+            place[0, :, self._tip] += by_place[k]
+            place[1, :, self._tip] += by_velocity[k]
+            for event in reversed(self._calls[k]):
+                for balance in reversed(balances_of(modal, event, self._first)):
+                    work, moved = _propagate_back(balance, q, place)
+                    for one in ports:
+                        for c, step in enumerate(np.eye(one.size)):
+                            by = one.change(modal, event, balance, np.broadcast_to(step, (n, one.size)))
+                            by_input[one.name][k, balance.rows, c] += _worked(by, work, moved)
+                    for twin in twins:
+                        by_number[twin.name][balance.rows] += _worked(
+                            twin.change(event, balance), work, moved
+                        )
+        return Gradient(value, by_input, by_number)
+
+    def _cost(self, cost: Cost) -> tuple[Floats, Floats, Floats]:
+        """The value, and its derivatives by what has inertia at the tip and by its velocity."""
+        tips = self.tips()
+        given, by = cost(tips)
+        value = np.asarray(given, dtype=np.float64)
+        if value.shape != (self._modal.n_robots,):
+            raise InputError(
+                f"cost returned a value of shape {value.shape}; give one number a robot, "
+                f"({self._modal.n_robots},)."
+            )
+        found = []
+        for name, known in tips._asdict().items():
+            array = np.zeros(known.shape) if getattr(by, name) is None else np.asarray(getattr(by, name))
+            if array.shape != known.shape:
+                raise InputError(
+                    f"cost returned derivatives by {name} of shape {array.shape}; give {known.shape}."
+                )
+            if not np.isfinite(array).all():
+                raise InputError(f"cost returned derivatives by {name} that are no numbers.")
+            found.append(array)
+        position, rotation, velocity = found
+        directors = np.swapaxes(rotation, 2, 3).reshape(*rotation.shape[:2], 9)
+        rest = np.zeros((*velocity.shape[:2], NODE_VECTORS - 3))
+        return value, np.concatenate([position, directors], 2), np.concatenate([velocity, rest], 2)
+
+    def _check(self) -> None:
+        if self.broken is not None:
+            raise InputError(self.broken)
+        if not self._calls:
+            raise InputError("nothing is recorded; call settle or step after record().")
+
+
+class Input:
+    """An input of every call, as the port that it is of the kernels."""
+
+    ports: ClassVar[dict[str, str]] = {
+        "tendon_length": "tendon_length",
+        "tension": "tension",
+        "tip_force": "tip_force",
+        "tip_moment": "tip_moment",
+        "follower_tip_force": "follower_force",
+        "line_force": "line_force",
+    }
+
+    def __init__(self, modal: ModalSolver, name: str) -> None:
+        """Raises `InputError` for an input by which there are no derivatives."""
+        if name not in self.ports:
+            raise InputError(f"there is no derivative by an input {name!r}; {nearest(name, self.ports)}")
+        length = float(np.max(modal.params.rod_length))
+        force, moment = float(np.max(modal.params.tension_scale)), float(np.max(modal.params.moment_scale))
+        units = {"tendon_length": length, "tip_moment": moment, "line_force": force / length}
+        self.name, self._delta = name, _STEP * units.get(name, force)
+        self.size = len(modal.layout.tendon_segment) if name.startswith("ten") else 3
+
+    def along(self, given: ArrayLike, n_calls: int, n_robots: int) -> Floats:
+        """(n_calls, n_robots, size) of a direction. Raises `InputError` for a wrong shape."""
+        array = np.asarray(given, dtype=np.float64)
+        shape = (n_calls, n_robots, self.size)
+        if array.ndim != 3 or array.shape not in (shape, (n_calls, 1, self.size)):
+            raise InputError(f"the direction {self.name} has shape {array.shape}; give {shape}.")
+        return np.broadcast_to(array, shape)
+
+    def change(self, modal: ModalSolver, event: Event, balance: Balance, step: Floats) -> Change:
+        """Of g and of what has inertia by this step (n_robots, size) of the input."""
+        port = self.ports[self.name]
+        now = getattr(event.acting.ports, port)
+        if not len(now):
+            raise InputError(f"{self.name} was not given; give it, zero if need be, to derive by it.")
+        if not step.any():
+            return None
+        add = self._delta * (step[:, None, None, :] if port == "line_force" else step)
+        sides = [
+            at_solution(modal, balance, event.acting.ports._replace(**{port: now + sign * add}))
+            for sign in (1.0, -1.0)
+        ]
+        return _difference(sides, balance.rows, 2.0 * self._delta)
+
+
+class Twin:
+    """The robots with another value of one number, larger and smaller."""
+
+    def __init__(self, robots: Sequence[Robot], modal: ModalSolver, name: str) -> None:
+        """Raises `InputError` where the robots have no such number."""
+        if any(robot.effects for robot in robots):
+            raise InputError(
+                "derivatives by a robot's numbers are of robots without effects; leave the effects out."
+            )
+        self.name, self._sides, self._delta = name, [], 0.0
+        largest = max(abs(number(robot, name)) for robot in robots)
+        delta = _STEP * (largest or 1.0)
+        ends = [delta, -delta]
+        try:
+            for robot in robots:
+                with_number(robot, name, number(robot, name) - delta)
+        except RobotError:  # it may not become smaller
+            ends[1] = 0.0
+        self._delta = ends[0] - ends[1]
+        for end in ends:
+            moved = [with_number(robot, name, number(robot, name) + end) for robot in robots]
+            layout, params, rest = compile_robots(moved, modal.layout.n_steps)
+            reader = Reader(layout, params, rest, modal.n_robots)
+            solver = ModalSolver(moved, layout, params, modal.n_robots, 1, modal.modes)
+            self._sides.append((reader, solver))
+
+    def change(self, event: Event, balance: Balance) -> Change:
+        """Of g and of what has inertia by the number."""
+        found = []
+        for reader, modal in self._sides:
+            ports = reader.ports(event.acting.given)
+            modal.place_points(*reader.loads, ports.extension)
+            gravity = modal.gravity if reader.gravity is None else reader.gravity
+            modal.pieces = modal.pieces._replace(gravity=gravity)
+            found.append(at_solution(modal, balance, ports))
+        return _difference(found, balance.rows, self._delta)
+
+
+Change: TypeAlias = "tuple[Floats, Floats] | None"
+"""(n_rows, n_q) of g and (n_rows, n) of what has inertia, both at fixed unknowns; None for none."""
+
+
+def _difference(sides: list[ModalDerivatives], rows: Ints, apart: float) -> Change:
+    ahead, behind = sides
+    by_q: Floats = (ahead.gradient[rows] - behind.gradient[rows]) / np.float64(apart)
+    moved: Floats = (ahead.number[rows] - behind.number[rows]) / np.float64(apart)
+    return by_q, moved
+
+
+def _propagate(balance: Balance, q: Floats, place: Floats, changes: list[Change]) -> None:
+    """Columns q (3, n_robots, n_q, m) and place (4, n_robots, n, m) through a balance; inputs change it by
+    `changes`."""
+    rows = balance.rows
+    before, was = q[:, rows], place[:, rows]
+    counted = balance.by_place[:, :, None] * np.tensordot(balance.counted, was, 1)
+    rate = np.tensordot(balance.rate, before, 1)
+    right = -np.swapaxes(balance.change, 1, 2) @ counted - balance.by_rate @ rate
+    shift = np.zeros_like(counted)
+    for j, change in enumerate(changes):
+        if change is not None:
+            right[:, :, j] += change[0]
+            shift[:, :, j] = change[1]
+    new = -np.linalg.solve(balance.hessian, right)
+    moved = balance.change @ new + shift
+    m = balance.moved
+    place[:, rows] = np.tensordot(m[:, :4], was, 1) + m[:, 4, None, None, None] * moved
+    q[:, rows] = np.tensordot(m[:3, :3], before, 1) + m[:3, 4, None, None, None] * new
+
+
+def _propagate_back(balance: Balance, q: Floats, place: Floats) -> tuple[Floats, Floats]:
+    """Derivatives of the cost by q (3, n_robots, n_q) and place (4, n_robots, n), from after a balance to
+    before it; those by g (n_rows, n_q), and by what has inertia (n_rows, n) at fixed unknowns."""
+    rows, m = balance.rows, balance.moved
+    after, was = q[:, rows], place[:, rows]
+    moved: Floats = np.tensordot(m[:, 4], was, 1)
+    by_q = np.tensordot(m[:3, 4], after, 1) + (moved[:, None] @ balance.change)[:, 0]
+    work: Floats = np.asarray(
+        np.linalg.solve(np.swapaxes(balance.hessian, 1, 2), by_q[:, :, None]), dtype=np.float64
+    )
+    by_place = balance.by_place * (balance.change @ work)[:, :, 0]
+    by_rate = (np.swapaxes(balance.by_rate, 1, 2) @ work)[:, :, 0]
+    place[:, rows] = np.tensordot(m[:, :4].T, was, 1) + balance.counted[:, None, None] * by_place
+    q[:, rows] = np.tensordot(m[:3, :3].T, after, 1) + balance.rate[:, None, None] * by_rate
+    return -work[:, :, 0], moved
+
+
+def _worked(change: Change, work: Floats, moved: Floats) -> Floats:
+    """(n_rows,) derivative of the cost by what changes g and what has inertia so."""
+    if change is None:
+        return np.zeros(len(work))
+    return np.asarray((change[0] * work).sum(1) + (change[1] * moved).sum(1))
+
+
+def _as_tips(place: Floats, velocity: Floats) -> Tips:
+    """Of the numbers of the last node (n_calls, n_robots, 12, ...)."""
+    directors = place[:, :, 3:].reshape(*place.shape[:2], 3, 3, *place.shape[3:])
+    return Tips(place[:, :, :3], np.swapaxes(directors, 2, 3), velocity[:, :, :3])
