@@ -189,6 +189,7 @@ def rod_of(
     max_contacts: int,
     points_per_segment: int,
     capsules_per_segment: int,
+    dynamics: bool = False,
 ) -> Rod:
     """Build the rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
     scene = None
@@ -203,6 +204,7 @@ def rod_of(
         contact=scene,
         points_per_segment=points_per_segment,
         capsules_per_segment=capsules_per_segment,
+        dynamics=dynamics,
     )
 
 

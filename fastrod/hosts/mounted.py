@@ -42,12 +42,14 @@ class MountedRod(CarriedRod):
         points_per_segment: int = 10,
         capsules_per_segment: int = 10,
         max_contacts: int = 16,
+        dynamics: bool = False,
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
         head_color: Sequence[float] | None = None,
     ) -> None:
         """`contact_bodies`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on
-        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). The time step is
-        the world's. Raises `HostError`, `InputError`."""
+        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). With `dynamics`
+        the link feels the rod's inertia as well (without `contact_bodies`). The time step is the world's.
+        Raises `HostError`, `InputError`."""
         if not isinstance(host, BulletLink):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
@@ -70,6 +72,7 @@ class MountedRod(CarriedRod):
             max_contacts=max_contacts,
             points_per_segment=points_per_segment,
             capsules_per_segment=capsules_per_segment,
+            dynamics=dynamics,
         )
         self._nodes_per_capsule = points_per_segment // capsules_per_segment
         radii = self.rod.radius.tolist()

@@ -127,6 +127,7 @@ class MujocoRod(CarriedRod):
         name: str = "rod",
         points_per_segment: int = 10,
         max_contacts: int = 16,
+        dynamics: bool = False,
     ) -> None:
         """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion`
         (4,) w x y z, body_from_base. `contact_bodies`: names or numbers of bodies; `friction` of the rod on
@@ -159,6 +160,7 @@ class MujocoRod(CarriedRod):
             self.body_contacts,
             dt=self.dt,
             max_contacts=max_contacts,
+            dynamics=dynamics,
             points_per_segment=points_per_segment,
             capsules_per_segment=per_segment,
         )

@@ -20,6 +20,7 @@ from fastrod.hosts.host import Motion
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.solver.merge import merge_shape
+from fastrod.solver.modal import Modes
 from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints
 
@@ -90,10 +91,16 @@ class Rod:
         points_per_segment: int = 10,
         capsules_per_segment: int = 10,
         threads: int | None = 1,
+        dynamics: bool = False,
+        rho: float = 0.0,
+        modes: Modes | None = None,
     ) -> None:
         """`dt`: the rod's longest step [s]; an engine's longer step is done in equal substeps. `contact`:
-        what the rod feels. Capsules are as thick as contact has the rod. Raises `InputError`,
-        `RobotError`."""
+        what the rod feels. Capsules are as thick as contact has the rod. With `dynamics` the rod has its
+        inertia (`Simulator`), in the wrench as well: `settle` is at rest in the world, and the base's twist
+        is felt from the next step on. Its scheme is generalized-alpha, which takes steps of any length; with
+        `rho` 0 a host that is free must be 8 times as heavy as the rod, with 0.5 more than 20 times
+        (tests/wings/test_rod_in_motion.py). Raises `InputError`, `RobotError`."""
         check_robot(robot)
         if isinstance(n_robots, bool):
             raise InputError(
@@ -127,6 +134,9 @@ class Rod:
             points_per_segment,
             threads=threads,
             contact=contact,
+            dynamics=dynamics,
+            rho=rho if dynamics else 0.5,
+            modes=modes,
         )
         """Its `jacobian`, `compliance`, `shape` are those of the last state."""
         self.dt = self.simulator.dt

@@ -18,7 +18,7 @@ from fastrod.simulator import Simulator
 
 HOME, STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (0.0,) * 6
 PULL = np.array([-3, 0, 3, 0, -6, 2, 6, -2]) * 1e-3
-LAGGED = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
+LAGGED = replace(soft_robot(1), effects=({"name": "second_order_lag", "period": 0.1, "damping": 0.7},))
 """Its tendons remember: a lag of second order."""
 
 
