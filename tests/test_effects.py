@@ -250,7 +250,7 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
     """What a sweep leaves behind: numbers in every column of a tendon, a bend or a step, and no other."""
-    columns_of = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
+    columns_of = {"backlash": 3, "friction": 6, "creep": 2, "second_order_lag": 3}
     assert {*columns_of, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()
     wiring, n = route(robot), robot.n_tendons
@@ -433,6 +433,15 @@ def test_measure_sees_from_the_base() -> None:
 
 
 # What the library says of itself
+
+
+@pytest.mark.parametrize("name", ["dynamics", "inertia", "oscillation"])
+def test_a_filter_on_the_tendons_is_not_called_dynamics(name: str) -> None:
+    """A robot file with the old name is answered with the new one, and with what has inertia."""
+    with pytest.raises(UnknownNameError, match=r"second_order_lag.*Simulator\(dynamics=True\)") as refused:
+        Simulator(having(two_segments(), {"name": name, "period": 0.1}))
+    assert str(refused.value).count("\n") == 0
+    assert name not in NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -69,7 +69,7 @@ def wild(result: Result) -> Result:
     delay = Estimate(value=0.043, stderr=0.002, unit="s", identifiable=True, prior_sd=0.1, at_bound=True)
     mass = Estimate(value=0.012, stderr=NAN, unit="kg", identifiable=True, prior_sd=NAN)
     more = [
-        found("latency", "Delay <b> & more", 0.04, {"z": NAN}, ["dynamics"], delay=delay),
+        found("latency", "Delay <b> & more", 0.04, {"z": NAN}, ["second_order_lag"], delay=delay),
         found("payload", "Mass", 0.2, mass=mass),
     ]
     gain = Estimate(value=0.0, stderr=0.3, unit="", identifiable=False, why="no <load>", prior_sd=0.3)
@@ -204,7 +204,7 @@ def test_page_escapes_what_others_wrote_and_takes_what_is_missing(result: Result
     assert "script" not in read.tags
     assert escape("a <script>alert(1)</script> & $x$") in html
     odd = ("Delay <b> & more", "it <jumps>", "turn <it>", "odd & even", "no <load>")
-    for text in (*odd, "at bound", "dynamics", "43.0 ± 2.0 ms"):
+    for text in (*odd, "at bound", "second order lag", "43.0 ± 2.0 ms"):
         assert text in read.words, text
     plain = unescape(re.sub(r"base64,[^\"]*|<style.*?</style>", "", html, flags=re.DOTALL))
     assert "nan" not in plain.lower()
@@ -253,7 +253,12 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
     console.print(report.table(wild(result)))
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
-    words = ("tip error, rms [mm]", "backlash", "half width", "latency cannot be distinguished from dynamics")
+    words = (
+        "tip error, rms [mm]",
+        "backlash",
+        "half width",
+        "latency cannot be distinguished from second order lag",
+    )
     for word in (*words, "run next: turn <it>"):
         assert word in text, word
 

@@ -100,6 +100,9 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     )
     replay.add_argument("--run", metavar="RUN", help="only this run of the log")
     replay.add_argument(
+        "--dynamics", action="store_true", help="in motion, with inertia and damping (needs line_density)"
+    )
+    replay.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
@@ -130,6 +133,11 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         "--free-camera",
         action="store_true",
         help="fit the camera's registration, marker offset and latency too",
+    )
+    identify.add_argument(
+        "--dynamics",
+        action="store_true",
+        help="fit the robot's own parameters in motion; no effect is tried (needs line_density)",
     )
     identify.add_argument(
         "--network",

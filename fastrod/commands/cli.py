@@ -87,7 +87,9 @@ def _replay(arguments: argparse.Namespace) -> int:
         log = log.only(arguments.run)
     out = arguments.out or Path(f"{path.stem}_replay")
     with _folder(out), _progress() as bar:
-        result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
+        result = room.replay(
+            log, robot, dynamics=arguments.dynamics, progress=None if bar is None else partial(bar, "replay")
+        )
     console = Console()
     console.print(room.table(result))
     if not result.compared.any():
@@ -132,6 +134,7 @@ def _identify(arguments: argparse.Namespace) -> int:
             max_effects=arguments.max_effects,
             free_camera=arguments.free_camera,
             network=arguments.network,
+            dynamics=arguments.dynamics,
             progress=bar,
         )
     written = [] if out is None else report.write(result, out)

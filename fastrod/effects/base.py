@@ -227,6 +227,11 @@ class Operator(Law, ABC):
 
 _REGISTRY: dict[str, Effect] = {}
 _SYNONYMS: dict[str, str] = {}
+_RENAMED = dict.fromkeys(
+    ("dynamics", "inertia", "oscillation"),
+    "is called 'second_order_lag', for it filters the tendons and has no mass; a rod with inertia is "
+    "Simulator(dynamics=True).",
+)
 _SECTIONS = ("Equation", "Source", "Residual signature")
 _Class = TypeVar("_Class", bound=type)
 
@@ -289,6 +294,8 @@ def canonical_name(name: str) -> str:
     load_library()
     name = _SYNONYMS.get(name, str(name))
     if name not in _REGISTRY:
+        if name in _RENAMED:
+            raise UnknownNameError(f"the effect {name!r} {_RENAMED[name]}")
         raise UnknownNameError(f"no effect {name!r}; {nearest(name, [*_REGISTRY, *_SYNONYMS])}")
     return name
 

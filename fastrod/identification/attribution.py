@@ -14,12 +14,14 @@ from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
 from fastrod.identification.log.questions import read
 from fastrod.identification.log.registration import between
-from fastrod.identification.log.split import split, thinned
-from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.log.split import SplitLog, split, thinned
+from fastrod.identification.log.unknowns import Model, base_model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
+from fastrod.identification.report.motion import assemble_motion
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
+from fastrod.identification.search.motion import HORIZONS, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.logs.runlog import RunLog
@@ -45,6 +47,7 @@ def identify(
     free_camera: bool = False,
     exclude: Sequence[str] = (),
     network: bool = False,
+    dynamics: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
     threads: int | None = None,
 ) -> Result:
@@ -54,15 +57,22 @@ def identify(
     stretch of each run. `max_effects` at most are named. `exclude` takes effects out of the library.
     `free_camera` leaves registration, marker offset and latency to the fit. `network` trains a small network
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
+    `dynamics` replays the log in motion, with inertia and damping, and fits the robot's own parameters alone:
+    no effect is tried, the camera's place is not registered, and `free_camera` frees its priors only.
     Deterministic. Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
     if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
         raise InputError(f"max_effects is {max_effects!r}; it must be a whole number, 0 or more.")
+    if network and dynamics:
+        raise InputError("network=True is for a log at rest; leave it out with dynamics=True.")
     if network:
         check_network()
     progressed, most = progress or (lambda *_: None), max_effects + _SPARE + 2
     log = split([logs] if isinstance(logs, RunLog) else list(logs), robot, held_out)
-    base_model(robot, free_camera=free_camera)  # refuses a wrong [fit] before anything is solved
+    # refuses a wrong [fit] before anything is solved
+    model = base_model(robot, free_camera=free_camera, dynamics=dynamics)
+    if dynamics:
+        return _in_motion(log, robot, model, progressed, threads)
     progressed("registration", 0, most)
     some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
     reading = read(some, robot, threads=threads)
@@ -87,6 +97,26 @@ def identify(
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
     return replace(result, network=residual_network(log.samples, model.wiring, result)) if network else result
+
+
+def _in_motion(
+    log: SplitLog,
+    robot: Robot,
+    model: Model,
+    progressed: Callable[[str, int, int], None],
+    threads: int | None,
+) -> Result:
+    """The robot's own parameters, fitted to all training rows in motion."""
+    done, most = 0, len(HORIZONS) + 2
+
+    def report(what: str) -> None:
+        nonlocal done
+        progressed(what, done, most)
+        done += 1
+
+    found = fit_motion(log.samples.on(log.rows), model, robot, threads=threads, report=report)
+    progressed("prediction on all samples", most - 1, most)
+    return assemble_motion(log, robot, found, threads)
 
 
 def _candidates(

@@ -189,7 +189,7 @@ def _block(
         (
             "slow circle" if slow else "fast circle",
             np.concatenate([approach, circles, back]),
-            "routing, anisotropy; two speeds: latency and dynamics against creep",
+            "routing, anisotropy; two speeds: latency and lag against creep",
         )
     )
     for hold in range(3):

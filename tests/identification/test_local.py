@@ -111,7 +111,7 @@ FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
 # nothing but corners, and an oscillator that is sampled more slowly than it rings answers to its period at
 # any phase;
 MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006}
-MEMORY |= {"dynamics": 0.15}
+MEMORY |= {"second_order_lag": 0.15}
 # what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
 # that. Tendons that stretch by thirty times their compliance here do so by a third.
 ROD = {"gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03}
@@ -141,7 +141,7 @@ def assert_slopes(
 
 def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
     """The base's reference and a candidate at hardly anything: a twentieth of its typical size, its shape
-    where a fit starts. Dynamics as a fit starts it: a period far below the time between samples rings at any
+    where a fit starts. The lag as a fit starts it: a period far below the time between samples rings at any
     phase."""
     here = base()
     model = here.model.without(name).with_effect(name)
@@ -150,7 +150,7 @@ def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
     theta = np.concatenate([here.theta[others], model.start[first:]])
     for j in range(first, len(theta)):
         unknown = model.unknowns[j]
-        if name == "dynamics":
+        if name == "second_order_lag":
             theta[j] = unknown.outside({"period": 0.16, "damping": 0.6}[unknown.name.partition(".")[2]])
         elif not unknown.shape:
             theta[j] = unknown.mean + 0.05 * unknown.scale

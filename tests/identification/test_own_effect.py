@@ -115,7 +115,7 @@ def test_every_law_of_the_library_has_what_it_had() -> None:
     own = {name: signal_of(get_effect(name)) for name in effect_names() if trait(get_effect(name), "signal")}
     assert own == {
         "creep": Signal.LAG,
-        "dynamics": Signal.MOTION,
+        "second_order_lag": Signal.MOTION,
         "latency": Signal.MOTION,
         "temperature": Signal.TIME,
         "time_drift": Signal.TIME,

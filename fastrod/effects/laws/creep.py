@@ -37,10 +37,10 @@ class Creep(Operator):
         ),
     )
     excited_by = "steps and holds of several time constants, the same path at two speeds"
-    confounded_with = ("friction", "time_drift", "dynamics")
+    confounded_with = ("friction", "time_drift", "second_order_lag")
     synonyms = ("relaxation", "viscoelasticity")
     separated_by: ClassVar[Mapping[str, str]] = {
-        "dynamics": "holds of 4 s and more",
+        "second_order_lag": "holds of 4 s and more",
         "time_drift": "the first block of motion once more at the end",
     }
     signal = Signal.LAG

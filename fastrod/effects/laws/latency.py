@@ -27,10 +27,10 @@ class Latency(Operator):
     order = 10.0
     parameters = (Parameter("delay", "s", bounds=(0.0, 1.0), typical=0.1, starts=(0.06, 0.15)),)
     excited_by = "motion at two speeds, with stops"
-    confounded_with = ("dynamics", "creep")
+    confounded_with = ("second_order_lag", "creep")
     synonyms = ("delay", "time_delay")
     separated_by: ClassVar[Mapping[str, str]] = {
-        "dynamics": "fast and slow motion with sudden stops, beyond 50 degrees: only dynamics ring",
+        "second_order_lag": "fast and slow motion with sudden stops, beyond 50 degrees: a delay rings not",
         "creep": "stops and holds: a delay is over after the delay",
     }
     signal = Signal.MOTION

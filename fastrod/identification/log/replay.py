@@ -35,6 +35,7 @@ CHUNK = 4096  # rows a batch: enough to fill every core, small enough for a stea
 _NONE = "–"
 _MEANING = "residual = measured - predicted"
 _STATIC = "the model is quasi-static: fast motion shows as residual"
+_MOVING = "the model is in motion, each run from rest at its first row"
 _MOST_RUNS = 20  # lines of the table; a log with more runs is read in residuals.csv
 
 
@@ -51,6 +52,8 @@ class Replay:
     """(n,) rows that the model solved."""
     points: Floats | None = None
     """(n, k, 3) predicted further points at the robot's `log_points` [m], where the log measured some."""
+    dynamics: bool = False
+    """In motion, and not at rest in each row."""
     questions: tuple[str, ...] = ()
     """What the log makes one ask about its units, signs, order, frame and time, a sentence each."""
 
@@ -111,7 +114,12 @@ class Replay:
         points = None if self.points is None else self.points[which]
         tip, converged = self.tip_position[which], self.converged[which]
         return Replay(
-            log=self.log.rows(which), robot=self.robot, tip_position=tip, converged=converged, points=points
+            log=self.log.rows(which),
+            robot=self.robot,
+            tip_position=tip,
+            converged=converged,
+            points=points,
+            dynamics=self.dynamics,
         )
 
 
@@ -120,6 +128,7 @@ def replay(
     robot: Robot,
     *,
     simulator: Callable[..., Any] | None = None,
+    dynamics: bool = False,
     progress: Progress | None = None,
 ) -> Replay:
     """The model's answer to every row of `log`, each row one robot of a batch.
@@ -127,6 +136,8 @@ def replay(
     Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins
     at rest. The measured frame is taken as the robot's base frame: nothing is registered and nothing is
     fitted. Where another reading of the log would follow far better, `questions` of the answer ask for it.
+    With `dynamics` each run is one rod in motion, from rest at its first row, with inertia and damping; then
+    `progress` counts time steps, and nothing is asked.
     `simulator` stands in for `fastrod.Simulator`, and leaves the questions out; `progress` is called with the
     rows done and the rows in all. Raises `LogError` where no row of the log can be compared, `InputError` for
     a robot that lengths do not drive.
@@ -137,6 +148,8 @@ def replay(
             f"log {log.name!r} has no row in which every input and the tip are there; there is "
             "nothing to compare."
         )
+    if dynamics:
+        return _in_motion(log, robot, progress)
     open_questions: tuple[str, ...] = ()
     rows, n_points = np.flatnonzero(log.driven), 0 if log.points is None else len(robot.log_points)
     tip, points = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan)
@@ -167,6 +180,29 @@ def replay(
         converged=converged,
         points=points if n_points else None,
         questions=open_questions,
+    )
+
+
+def _in_motion(log: RunLog, robot: Robot, progress: Progress | None) -> Replay:
+    from fastrod.identification.log.forward import sample  # they load numba
+    from fastrod.identification.log.motion import MotionReplay
+
+    with_points = log.points is not None and len(robot.log_points) > 0
+    samples = sample(log)
+    every = samples.on(np.arange(len(samples.log)))
+    (pose,) = MotionReplay(every, points=with_points).poses([robot], progress)
+    tip, converged = np.full((len(log), 3), np.nan), np.zeros(len(log), dtype=np.bool_)
+    points = np.full((len(log), len(robot.log_points), 3), np.nan)
+    tip[samples.origin], converged[samples.origin] = pose.position, pose.ok
+    if with_points:
+        points[samples.origin] = pose.points
+    return Replay(
+        log=log,
+        robot=robot,
+        tip_position=tip,
+        converged=converged,
+        points=points if with_points else None,
+        dynamics=True,
     )
 
 
@@ -239,7 +275,7 @@ def table(result: Replay) -> Table:
     grid.add_row("all", *_cells(result), style="bold")
     grid.caption = (
         f"{_MEANING}; rms, max of its length\nexcursion: measured tip from its own mean; {_NONE} "
-        f"if below the rms\n{_STATIC}"
+        f"if below the rms\n{_MOVING if result.dynamics else _STATIC}"
     )
     return grid
 
@@ -279,7 +315,8 @@ def draw(result: Replay) -> Figure:
         if len(shown.log) > DENSE
         else ""
     )
-    left.supxlabel(f"{_MEANING}; {_STATIC}\n{rows}", x=0.01, ha="left", fontsize=8, color=_INK)
+    how = _MOVING if result.dynamics else _STATIC
+    left.supxlabel(f"{_MEANING}; {how}\n{rows}", x=0.01, ha="left", fontsize=8, color=_INK)
     return figure
 
 

@@ -23,11 +23,23 @@ _SEGMENT = {
     "bending_stiffness": "N m^2",
     "torsional_stiffness": "N m^2",
     "line_density": "kg/m",
+    "damping_time": "s",
+    "axial_stiffness": "N",
+    "shear_stiffness": "N",
 }
-_TENDON = {"offset": "m", "angle": "rad", "compliance": "m/N", "gain": "", "zero": "m"}
+_TENDON = {"offset": "m", "angle": "rad", "compliance": "m/N", "pretension": "N", "gain": "", "zero": "m"}
+MOTION = ("damping_time", "axial_stiffness", "shear_stiffness", "mass")
+"""Parameters that only a fit in motion changes."""
 # a shared one of these is the same number for all; of the others, the same factor
 _ADDED = ("angle", "gain", "zero")
-_POSITIVE = ("length", "bending_stiffness", "torsional_stiffness", "offset")
+_POSITIVE: tuple[str, ...] = (
+    "length",
+    "bending_stiffness",
+    "torsional_stiffness",
+    "offset",
+    "axial_stiffness",
+)
+_POSITIVE += ("shear_stiffness",)
 STIFFNESS_SD = 0.3
 """Relative prior of EI and GJ where the robot file says nothing."""
 FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
@@ -54,7 +66,8 @@ class Unknown:
     scale: float
     """A typical size, for differences."""
     place: tuple[str, ...]
-    """("robot", field, numbers...) or ("effect", name, columns...)."""
+    """("robot", field, numbers...) or ("effect", name, columns...). The field of a lump is "mass", and its
+    number "segment.lump"."""
     log: bool = False
     """Fitted as a logarithm."""
     shape: bool = False
@@ -158,17 +171,25 @@ def known_model(robot: Robot) -> Model:
     return Model(robot, route(robot), tuple(named_effects(robot)), ())
 
 
-def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = False) -> Model:
+def base_model(
+    robot: Robot, *, free_camera: bool = False, registered: bool = False, dynamics: bool = False
+) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
 
-    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted.
-    Raises `RobotError` for a target that is none, naming the nearest.
+    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. `dynamics`:
+    it is fitted in motion. Raises `RobotError` for a target that is none, naming the nearest, and for one
+    that only motion shows without it.
     """
     wiring = route(robot)
     unknowns: list[Unknown] = []
     effects = list(named_effects(robot))
     for target, prior in robot.fit.items():
         unknowns += _targets(robot, wiring, target, prior)
+        if not dynamics and unknowns[-1].place[1] in MOTION:
+            raise RobotError(
+                f"robot {robot.name!r}: [fit] {target!r} is fitted in motion; identify with --dynamics "
+                "(dynamics=True)."
+            )
     for kind in ("bending_stiffness", "torsional_stiffness"):
         if not any(u.place[:2] == ("robot", kind) for u in unknowns):
             name = f"segment.*.{kind}"
@@ -243,28 +264,28 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
     match = re.fullmatch(r"(segment|tendon)\.(\*|\d+)\.(\w+)", target)
     kinds = {"segment": _SEGMENT, "tendon": _TENDON}
     names = [f"{word}.*.{kind}" for word, table in kinds.items() for kind in table]
+    if lump := re.fullmatch(r"segment\.(\d+)\.lump\.(\d+)\.mass", target):
+        return [
+            _lump_unknown(
+                robot, target, (int(lump[1]) - 1, int(lump[2]) - 1), _checked_sd(robot, target, prior)
+            )
+        ]
     if match is None or match[3] not in kinds[match[1]]:
         raise RobotError(f"robot {robot.name!r}: [fit] {target!r} is no parameter; {nearest(target, names)}")
     word, number, kind = match[1], match[2], match[3]
     count = robot.n_segments if word == "segment" else robot.n_tendons
     if number != "*" and not 1 <= int(number) <= count:
         raise RobotError(f"robot {robot.name!r}: [fit] {target!r}; the robot has {word}s 1 to {count}.")
-    unknown = [key for key in prior if key not in ("sd", "shared")]
-    if unknown or "sd" not in prior:
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and "
-            "shared = true for one for all."
-        )
-    sd = float(prior["sd"])
-    if not (math.isfinite(sd) and sd > 0.0):
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} has sd {sd!r}; it must be positive: leave "
-            "out what is known."
-        )
+    sd = _checked_sd(robot, target, prior)
     which = list(range(count)) if number == "*" else [int(number) - 1]
     if kind in ("gain", "zero"):
         return _drive_unknowns(wiring, kind, which, sd, bool(prior.get("shared")), target)
     nominal = [_nominal(robot, kind, k) for k in which]
+    if not all(map(math.isfinite, nominal)):
+        raise RobotError(
+            f"robot {robot.name!r}: [fit] {target!r} has no value to begin from; give the segment "
+            f"a finite {kind}."
+        )
     unit = (_SEGMENT if word == "segment" else _TENDON)[kind]
     if prior.get("shared") and len(which) > 1:
         places = ("robot", kind, *map(str, which))
@@ -286,9 +307,10 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
         ]
     made = []
     for k, value in zip(which, nominal, strict=True):
-        low = max(
-            value - 10.0 * sd, 0.05 * value if kind in _POSITIVE else -math.inf if kind == "angle" else 0.0
-        )
+        least = 0.05 * value if kind in _POSITIVE else 0.0
+        if kind == "angle" or (kind == "pretension" and not robot.tendons[k].unilateral):
+            least = -math.inf
+        low = max(value - 10.0 * sd, least)
         step = min(0.3 * sd, 0.05 * abs(value) or math.inf)
         made.append(
             Unknown(
@@ -303,6 +325,35 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
             )
         )
     return made
+
+
+def _checked_sd(robot: Robot, target: str, prior: Mapping[str, float]) -> float:
+    unknown = [key for key in prior if key not in ("sd", "shared")]
+    if unknown or "sd" not in prior:
+        raise RobotError(
+            f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and "
+            "shared = true for one for all."
+        )
+    sd = float(prior["sd"])
+    if not (math.isfinite(sd) and sd > 0.0):
+        raise RobotError(
+            f"robot {robot.name!r}: [fit] {target!r} has sd {sd!r}; it must be positive: leave "
+            "out what is known."
+        )
+    return sd
+
+
+def _lump_unknown(robot: Robot, target: str, place: tuple[int, int], sd: float) -> Unknown:
+    k, m = place
+    if not (0 <= k < robot.n_segments and 0 <= m < len(robot.segments[k].lumps)):
+        counts = ", ".join(str(len(s.lumps)) for s in robot.segments)
+        raise RobotError(
+            f"robot {robot.name!r}: [fit] {target!r}; its segments have {counts} lumps, counted from 1."
+        )
+    mass = robot.segments[k].lumps[m].mass
+    step = min(0.3 * sd, 0.05 * mass or math.inf)
+    bounds = max(mass - 10.0 * sd, 0.0), mass + 10.0 * sd
+    return Unknown(target, "kg", mass, mass, sd, bounds, step, ("robot", "mass", f"{k}.{m}"))
 
 
 def _drive_unknowns(
@@ -380,6 +431,12 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
     """`robot` with one unknown set; a shared one is a factor on, or an addition to, each nominal value."""
     _, kind, *numbers = unknown.place
     segments = list(robot.segments)
+    if kind == "mass":
+        k, m = map(int, numbers[0].split("."))
+        masses = list(segments[k].lumps)
+        masses[m] = replace(masses[m], mass=value)
+        segments[k] = replace(segments[k], lumps=tuple(masses))
+        return replace(robot, segments=tuple(segments))
     shared = len(numbers) > 1 or unknown.unit == "x nominal"
     for number in map(int, numbers):
         was = _nominal(nominal, kind, number)
@@ -388,9 +445,9 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             own: Any = getattr(nominal.segments[number], kind)
             new: Any = tuple(v * now / was for v in own) if isinstance(own, tuple) else now
             if kind == "length":
-                segments[number] = replace(
-                    segments[number], length=now, extension=_range(segments[number].extension, now)
-                )
+                old = segments[number]
+                lumps = tuple(replace(lump, at=lump.at * now / old.length) for lump in old.lumps)
+                segments[number] = replace(old, length=now, extension=_range(old.extension, now), lumps=lumps)
             else:
                 segments[number] = replace(segments[number], **{kind: new})
         else:

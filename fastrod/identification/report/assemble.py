@@ -14,13 +14,14 @@ from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.split import SplitLog, thinned
+from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.verdict import VerdictGrounds, choose_verdict
 from fastrod.identification.search.base import SEEN, BaseFit, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.search import Search, SearchOutcome
-from fastrod.identification.search.solve import Estimate, covariance, rms
+from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
@@ -78,7 +79,7 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
     outlier[seen] = ~keep(samples.on(seen), residual[seen], base.noise)
     used, test = measured & ~log.tested & ~outlier, measured & log.tested & ~outlier
-    errors = (_error(samples, before, after, which) for which in (used, test))
+    errors = (error_of(samples, before, after, which) for which in (used, test))
     return Explained(search, start, state, names, outlier, used, test, before, after, *errors)
 
 
@@ -117,9 +118,9 @@ def assemble(
     if not kept:
         after = before
         train_error, test_error = (replace(e, after=e.before) for e in (train_error, test_error))
-        test_error = replace(test_error, interval=_interval(samples, before, explained.test))
+        test_error = replace(test_error, interval=interval_of(samples, before, explained.test))
         path = path[:1]
-    estimates, correlation = _estimates(final)
+    estimates, correlation = estimates_of(final.model, final.fit)
     classes = _classes(steps, kept)
     effects = [_effect(name, estimates, classes, path, steps, noise.floor) for name in kept]
     wiring = final.model.wiring
@@ -256,14 +257,15 @@ def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
     return made
 
 
-def _estimates(state: ModelState) -> tuple[dict[str, Estimate], tuple[list[str], Floats]]:
-    n = len(state.model.unknowns)
-    C = covariance(state.fit)[:n, :n]
+def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[list[str], Floats]]:
+    """The fitted numbers of a model with their standard errors, and their names and correlations."""
+    n = len(model.unknowns)
+    C = covariance(fit)[:n, :n]
     stderr = np.sqrt(np.maximum(np.diag(C), 0.0)) if n else np.zeros(0)
-    _, sd = state.model.prior
+    _, sd = model.prior
     made = {}
     for u, number, error, prior, at in zip(
-        state.model.unknowns, state.theta, stderr, sd, state.fit.at_bound, strict=False
+        model.unknowns, fit.theta[:n], stderr, sd, fit.at_bound, strict=False
     ):
         value = u.inside(float(number))
         seen = bool(error < SEEN * prior)
@@ -277,7 +279,7 @@ def _estimates(state: ModelState) -> tuple[dict[str, Estimate], tuple[list[str],
             prior_sd=float(prior * value if u.log else prior),
         )
     spread = np.where(stderr > 0.0, stderr, 1.0)
-    return made, ([u.name for u in state.model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
+    return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
 
 def _everywhere(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
@@ -295,14 +297,15 @@ def _distance(samples: LogSamples, predicted: Floats, which: Flags) -> Floats:
     return np.asarray(squares[np.isfinite(squares)])
 
 
-def _error(samples: LogSamples, before: Floats, after: Floats, which: Flags) -> Error:
+def error_of(samples: LogSamples, before: Floats, after: Floats, which: Flags) -> Error:
+    """Distance rms [m] at the samples of a mask, of tips (n, 3) predicted before and after."""
     if not which.any():
         return Error(before=float("nan"), after=float("nan"), interval=(float("nan"), float("nan")))
     values = [float(np.sqrt(_distance(samples, p, which).mean())) for p in (before, after)]
-    return Error(before=values[0], after=values[1], interval=_interval(samples, after, which))
+    return Error(before=values[0], after=values[1], interval=interval_of(samples, after, which))
 
 
-def _interval(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[float, float]:
+def interval_of(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[float, float]:
     """95 % interval of a distance rms, by resampling blocks of samples."""
     squares = _distance(samples, predicted, which)
     if len(squares) < 20:

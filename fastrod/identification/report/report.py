@@ -90,6 +90,9 @@ def to_json(result: Result) -> dict[str, Any]:
         "notes": list(result.notes),
         "solves": result.solves,
     }
+    if result.as_given_rms is not None:
+        for key, rms in zip(("train", "held_out"), result.as_given_rms, strict=True):
+            made["error"][key]["shipped_rms_m"] = rms
     if result.network:
         made["network"] = dict(result.network)
     plain: dict[str, Any] = _plain(made)

@@ -124,6 +124,9 @@ class Result:
     registration: CameraRegistration | None = None
     """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
     search."""
+    as_given_rms: tuple[float, float] | None = None
+    """Of the robot as it was given, on fitted and on held-out samples [m]; None where it was not asked
+    for."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
 

@@ -1,4 +1,4 @@
-"""Inertia: the bend follows its tendons as a damped oscillator."""
+"""Lag of second order: the tendons follow their command as a damped oscillator does."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from fastrod.types import Floats
 
 
 @effect
-class Dynamics(Operator):
-    """Inertia: the bend follows its tendons as a damped oscillator.
+class SecondOrderLag(Operator):
+    """Lag of second order: the tendons follow their command as a damped oscillator does.
+
+    A filter on the tendons, with no mass in it: it rings with the command and not with a load. A rod with
+    inertia is `Simulator(dynamics=True)`.
 
     Equation: T^2 y'' + 2 z T y' + y = theta
-    Source: first bending mode of a cantilever, f = 0.56 sqrt(EI / (m l^3))
+    Source: second-order lag of linear control, T^2 s^2 + 2 z T s + 1 in the denominator
     Residual signature: ringing after stops, lag that grows with speed
     """
 
@@ -29,7 +32,6 @@ class Dynamics(Operator):
     )
     excited_by = "steps and fast reversals, sampled at ten times the frequency"
     confounded_with = ("latency", "creep")
-    synonyms = ("inertia", "oscillation")
     signal = Signal.MOTION
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:

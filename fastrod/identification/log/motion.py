@@ -1,0 +1,196 @@
+"""A log through rods in motion: each run from rest at its first sample on, many robots side by side.
+
+Time steps are even and no longer than `LONGEST_STEP`; between two samples the inputs go evenly from one to
+the other. A payload is a mass at the tip here, with its inertia, and not only a weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from fastrod.errors import InputError, LogError
+from fastrod.identification.log.forward import LogSamples, PredictedPose
+from fastrod.identification.log.inputs import inputs
+from fastrod.model.robot import Lump, Robot
+from fastrod.types import Flags, Floats, Ints
+
+LONGEST_STEP = 1e-3
+"""s. Generalized-alpha is second order; `identify` says what half of it would change."""
+_ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
+_MOST_STEPS = 2_000_000  # of a run
+
+
+@dataclass(frozen=True, eq=False)
+class MotionReplay:
+    """What rods do in motion when they are driven as `samples` says, at its rows."""
+
+    samples: LogSamples
+    points: bool = False
+    """The robot's `log_points` too."""
+    longest_step: float = LONGEST_STEP
+    threads: int | None = None
+    """None: one. A batch of differences fills a few lanes."""
+
+    def poses(
+        self, robots: Sequence[Robot], progress: Callable[[int, int], None] | None = None
+    ) -> list[PredictedPose]:
+        """What the camera sees of each of these robots, effects and all. They must differ in numbers only.
+
+        `ok` is False from where the rod is lost to the end of its run. Raises `InputError` for a robot
+        without mass, `LogError` for a payload that changes within a run.
+        """
+        from fastrod.simulator import Simulator
+
+        runs = self._compared()
+        clock, masses = _clock(self.samples, runs, self.longest_step), self._payloads(runs)
+        rods = [_with_payload(robot, mass) for robot in robots for mass in masses]
+        sim = Simulator(
+            rods,
+            dt=clock.dt,
+            points_per_segment=4,
+            outputs="full" if self.points else "tip",
+            threads=self.threads or 1,
+            dynamics=True,
+        )
+        given = _prepared(self.samples, robots[0])
+        alive, seen = np.ones(len(rods), bool), list[Floats]()
+        kept = np.zeros((len(clock.wanted), len(rods)), bool)
+        last = int(clock.wanted[-1])
+        for step in range(last + 1):
+            now: dict[str, Any] = {
+                name: np.tile(a, (len(robots), *[1] * (a.ndim - 1))) for name, a in clock.at(step, given)
+            }
+            state = sim.step(**now) if step else sim.settle(**now)
+            alive &= state.ok
+            if step == clock.wanted[len(seen)]:
+                kept[len(seen)] = alive
+                found = sim.measure()
+                flat = [np.reshape(a, (len(rods), -1)) for a in found]
+                seen.append(np.concatenate(flat, axis=1))
+            if progress is not None and step % 100 == 0:
+                progress(step, last)
+        record = np.stack(seen)  # (n_wanted, n_rods, 12 + 3 k)
+        each = [slice(i * len(runs), (i + 1) * len(runs)) for i in range(len(robots))]
+        return [self._pose(clock, runs, record[:, own], kept[:, own]) for own in each]
+
+    def _compared(self) -> list[slice]:
+        """Samples of the runs in which any row is compared."""
+        rows = self.samples.rows
+        return [s for s in self.samples.runs if ((rows >= s.start) & (rows < s.stop)).any()]
+
+    def _pose(self, clock: _Clock, runs: list[slice], record: Floats, alive: Flags) -> PredictedPose:
+        """Of one robot, at the rows."""
+        rows = self.samples.rows
+        found = np.full((len(rows), record.shape[2]), np.nan)
+        ok = np.zeros(len(rows), bool)
+        for k, span in enumerate(runs):
+            mine = np.flatnonzero((rows >= span.start) & (rows < span.stop))
+            at = self.samples.time[rows[mine]] / clock.dt
+            if clock.even:
+                place = np.searchsorted(clock.wanted, np.rint(at))
+                found[mine], ok[mine] = record[place, k], alive[place, k]
+            else:
+                last = int(np.flatnonzero(alive[:, k])[-1]) if alive[:, k].any() else 0
+                ok[mine] = at <= last + _ON_STEP if last >= 3 else False
+                inside = mine[ok[mine]]
+                if len(inside):
+                    spline = CubicSpline(np.arange(last + 1), record[: last + 1, k])
+                    found[inside] = spline(at[ok[mine]])
+        found[~ok] = np.nan
+        n = len(rows)
+        return PredictedPose(
+            found[:, :3], found[:, 3:12].reshape(n, 3, 3), found[:, 12:].reshape(n, -1, 3), ok
+        )
+
+    def _payloads(self, runs: list[slice]) -> list[float | None]:
+        """The mass at the tip in each run [kg]; None where the log names none."""
+        payload = self.samples.log.payload
+        if payload is None or not payload.any():
+            return [None] * len(runs)
+        for span in runs:
+            if np.ptp(payload[span]) > 0.0:
+                label = str(self.samples.log.run[span.start]) or self.samples.log.name
+                raise LogError(
+                    f"the payload changes within run {label!r}; in motion it is a mass at the tip, the same "
+                    "for a whole run: give each its own run."
+                )
+        return [float(payload[span.start]) for span in runs]
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """Even steps that go through the samples of each run."""
+
+    dt: float
+    wanted: Ints
+    """Steps whose pose is kept: those of the samples where they are `even`, or all."""
+    even: bool
+    left: Ints
+    """(n_runs, n_steps) the sample before each step."""
+    weight: Floats
+    """(n_runs, n_steps) of the sample after it."""
+
+    def at(self, step: int, given: Mapping[str, Floats]) -> list[tuple[str, Floats]]:
+        """The inputs at a step, (n_runs, ...) each."""
+        left, made = self.left[:, step], []
+        for name, array in given.items():
+            w = self.weight[:, step].reshape(-1, *[1] * (array.ndim - 1))
+            value = (1.0 - w) * array[left] + w * array[np.minimum(left + 1, len(array) - 1)]
+            if name == "base_pose":
+                value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
+            made.append((name, value))
+        return made
+
+
+def _clock(samples: LogSamples, runs: list[slice], longest: float) -> _Clock:
+    usual = samples.dt[samples.dt > 0.0]
+    if not len(usual):
+        raise LogError(
+            f"log {samples.log.name!r} has no two samples at different times; nothing moves in it."
+        )
+    middle = float(np.median(usual))
+    dt = middle / math.ceil(middle / longest - 1e-9)
+    at = samples.time[samples.rows] / dt
+    even = bool((np.abs(at - np.rint(at)) < _ON_STEP * np.maximum(1.0, np.rint(at) * 1e-3)).all())
+    n = math.ceil(float(at.max()) - _ON_STEP) + 1
+    if n > _MOST_STEPS:
+        raise InputError(
+            f"a run of log {samples.log.name!r} lasts {dt * n:.4g} s, {n} steps of {dt:.3g} s; "
+            f"motion takes {_MOST_STEPS} at most: cut the log into runs."
+        )
+    left, weight = np.zeros((len(runs), n), np.int64), np.zeros((len(runs), n))
+    t = dt * np.arange(n)
+    for k, span in enumerate(runs):
+        own = samples.time[span]
+        i = np.clip(np.searchsorted(own, t + 1e-9 * dt, side="right") - 1, 0, max(len(own) - 2, 0))
+        width = np.diff(own)[i] if len(own) > 1 else np.ones(n)
+        left[k] = span.start + i
+        weight[k] = np.clip((t - own[i]) / np.where(width > 0.0, width, 1.0), 0.0, 1.0)
+    wanted = np.unique(np.rint(at).astype(np.int64)) if even else np.arange(n)
+    return _Clock(dt, wanted, even, left, weight)
+
+
+def _prepared(samples: LogSamples, robot: Robot) -> dict[str, Floats]:
+    """Inputs of every sample; the payload is a mass of the robot's own."""
+    given: dict[str, Any] = dict(inputs(replace(samples.log, payload=None), robot))
+    if (pose := given.get("base_pose")) is not None:
+        q = pose[:, 3:]
+        same = np.where((q[1:] * q[:-1]).sum(1) < 0.0, -1.0, 1.0)  # q and -q are one orientation
+        given["base_pose"] = np.column_stack([pose[:, :3], q * np.cumprod([1.0, *same])[:, None]])
+    if not given:
+        given["tip_force"] = np.zeros((len(samples.log), 3))
+    return given
+
+
+def _with_payload(robot: Robot, mass: float | None) -> Robot:
+    if mass is None:
+        return robot
+    *before, last = robot.segments
+    last = replace(last, lumps=(*last.lumps, Lump(at=last.length, mass=mass)))
+    return replace(robot, segments=(*before, last))

@@ -1,0 +1,205 @@
+"""Logs in motion: replayed in time, and the robot's own parameters fitted to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from fastrod import Robot, Segment, Simulator, Tendon, save_robot
+from fastrod.commands.cli import main
+from fastrod.errors import InputError, LogError, RobotError
+from fastrod.identification.attribution import identify
+from fastrod.identification.log.forward import sample
+from fastrod.identification.log.motion import MotionReplay
+from fastrod.identification.log.replay import replay
+from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.report.result import Result
+from fastrod.logs.runlog import RunLog, write_log
+from fastrod.model.robot import Lump
+
+NOISE = 1e-4  # m
+TRUE = {"density": 0.33, "mass": 0.025, "damping": 0.006, "axial": 300.0, "shear": 80.0, "pretension": 1.5}
+ALL = {
+    "segment.1.line_density": {"sd": 0.1},
+    "segment.1.lump.1.mass": {"sd": 0.01},
+    "segment.1.damping_time": {"sd": 0.005},
+    "segment.1.axial_stiffness": {"sd": 150.0},
+    "segment.1.shear_stiffness": {"sd": 50.0},
+    "tendon.*.pretension": {"sd": 1.0, "shared": True},
+    "segment.*.bending_stiffness": {"sd": 1e-6, "shared": True},
+    "segment.*.torsional_stiffness": {"sd": 1e-6, "shared": True},
+}
+
+
+def robot(
+    density: float = 0.3,
+    mass: float = 0.02,
+    damping: float = 0.004,
+    axial: float = 400.0,
+    shear: float = 100.0,
+    pretension: float = 1.0,
+    **more: Any,
+) -> Robot:
+    """Four tendons at right angles on 0.12 m, a disk at the tip."""
+    angles = 0.5 * np.pi * np.arange(4)
+    tendons = [Tendon(offset=0.0075, angle=a, compliance=1e-4, pretension=pretension) for a in angles]
+    segment = Segment(
+        length=0.12,
+        bending_stiffness=(0.0022, 0.0022),
+        torsional_stiffness=1e-3,
+        body_radius=0.012,
+        line_density=density,
+        damping_time=damping,
+        axial_stiffness=axial,
+        shear_stiffness=shear,
+        lumps=(Lump(at=0.12, mass=mass),),
+        tendons=tuple(tendons),
+    )
+    return Robot(name="moving", segments=(segment,), **more)
+
+
+def commands(seed: int, t: np.ndarray) -> np.ndarray:
+    """(n, 4) smooth changes of tendon length [m] from rest, up to 5 Hz, antagonists and a common pull."""
+    rng, dl = np.random.default_rng(seed), np.zeros((len(t), 4))
+    for frequency in (0.5, 1.3, 2.9, 5.1):
+        for j in range(2):
+            phase = rng.uniform(0.0, 6.0)
+            wave = np.sin(2.0 * np.pi * frequency * t + phase) - np.sin(phase)
+            dl[:, j] += rng.uniform(-1.5e-3, 1.5e-3) * wave
+    dl[:, 2:] = -dl[:, :2]
+    return dl - 4e-4 * (1.0 - np.cos(2.0 * np.pi * 3.7 * t))[:, None]
+
+
+def recorded(plant: Robot, runs: dict[str, int], t: np.ndarray, noise: float, step: float = 5e-4) -> RunLog:
+    """What a plant does in motion at a time step finer than the fit's, with noise; a run for each seed."""
+    dl = np.concatenate([commands(seed, t) for seed in runs.values()])
+    labels = np.repeat(list(runs), len(t))
+    log = RunLog(
+        name="motion", t=np.tile(t, len(runs)), run=labels, dl=dl, tip_position=np.zeros((len(dl), 3))
+    )
+    samples = sample(log)
+    (pose,) = MotionReplay(samples, longest_step=step).poses([plant])
+    tip = pose.position + noise * np.random.default_rng(7).normal(size=pose.position.shape)
+    return replace(log, tip_position=tip)
+
+
+@pytest.fixture(scope="module")
+def found() -> Result:
+    log = recorded(robot(**TRUE), {"fitted": 1, "other": 2}, np.arange(100) * 0.01, NOISE)
+    return identify(log, robot(fit=ALL), held_out=["other"], dynamics=True)
+
+
+def test_parameters_are_recovered_within_their_standard_errors(found: Result) -> None:
+    """Six of them, from commands and tip alone; 3 standard errors, or one log of 70 fails by chance."""
+    names = {
+        "segment.1.line_density": TRUE["density"],
+        "segment.1.lump.1.mass": TRUE["mass"],
+        "segment.1.damping_time": TRUE["damping"],
+        "segment.1.axial_stiffness": TRUE["axial"],
+        "segment.1.shear_stiffness": TRUE["shear"],
+    }
+    for name, true in names.items():
+        estimate = found.base_parameters[name]
+        assert abs(estimate.value - true) < 3.0 * estimate.stderr, (name, estimate)
+        assert estimate.stderr < estimate.prior_sd
+    pretension = found.base_parameters["tendon.*.pretension"]  # a factor on the nominal 1 N
+    assert abs(pretension.value - TRUE["pretension"]) < 3.0 * pretension.stderr
+    tight = {"segment.1.lump.1.mass": 0.02, "segment.1.damping_time": 0.02, "segment.1.line_density": 0.05}
+    for name, relative in tight.items():
+        assert found.base_parameters[name].stderr < relative * names[name]
+
+
+def test_held_out_error_falls_to_the_noise(found: Result) -> None:
+    assert found.verdict == "none"
+    assert found.as_given_rms is not None
+    assert found.as_given_rms[1] > 3.0 * NOISE * np.sqrt(3.0)
+    assert_allclose(found.test.after, NOISE * np.sqrt(3.0), rtol=0.1)
+    (segment,) = found.identified.segments
+    assert segment.damping_time == found.base_parameters["segment.1.damping_time"].value
+    assert segment.lumps[0].mass == found.base_parameters["segment.1.lump.1.mass"].value
+
+
+def test_a_report_in_motion_says_what_was_not_tried() -> None:
+    """Backlash that nobody declared is left in the residual, and is not called explained."""
+    plant = robot(density=0.33, effects=({"name": "backlash", "half_width": 6e-4},))
+    log = recorded(plant, {"fitted": 1, "other": 2}, np.arange(100) * 0.01, NOISE, step=1e-3)
+    given = robot(fit={"segment.1.line_density": {"sd": 0.1}, "segment.1.damping_time": {"sd": 0.005}})
+    found = identify(log, given, held_out=["other"], dynamics=True)
+    assert found.verdict == "not_in_library"
+    assert found.effects == []
+    assert "no effect was tried" in found.summary
+    assert found.test.after > 2.0 * NOISE * np.sqrt(3.0)
+
+
+def test_replay_in_motion_is_the_simulator() -> None:
+    """Step by step, with the robot's own effects and each run from rest."""
+    plant = robot(effects=({"name": "friction", "half_width": 3e-4}, {"name": "marker_offset", "z": 5e-3}))
+    t = np.arange(40) * 2e-3
+    log = recorded(plant, {"a": 3, "b": 4}, t, 0.0, step=1e-3)
+    shown = replay(log, plant, dynamics=True)
+    assert shown.dynamics
+    assert shown.converged.all()
+    for run, seed in (("a", 3), ("b", 4)):
+        sim, dl, tips = Simulator(plant, dt=1e-3, dynamics=True, points_per_segment=4), commands(seed, t), []
+        between = np.stack([np.interp(np.arange(79) * 1e-3, t, row) for row in dl.T], axis=1)
+        for k, now in enumerate(plant.rest_tendon_length + between):
+            sim.step(now) if k else sim.settle(now)
+            tips.append(sim.measure().tip_position[0])
+        assert_allclose(shown.tip_position[log.run == run], tips[::2], atol=1e-12)
+    still = replay(log.only("a"), plant)
+    assert np.abs(still.tip_position - shown.tip_position[log.run == "a"]).max() > 1e-3
+
+
+def test_uneven_samples_are_interpolated() -> None:
+    """The same motion sampled off the steps: a cubic through steps of 1 ms."""
+    plant, t = robot(), np.arange(60) * 0.01
+    log = recorded(plant, {"a": 3}, t, 0.0, step=1e-3)
+    odd = np.sort(np.concatenate([t, t[:-1] + 0.0037]))
+    dl = np.stack([np.interp(odd, t, row) for row in log.dl.T], axis=1)
+    uneven = RunLog(name="u", t=odd, run=np.full(119, "a"), dl=dl, tip_position=np.zeros((119, 3)))
+    (at,) = MotionReplay(sample(uneven)).poses([plant])
+    assert at.ok.all()
+    # another time step, second order: the motion is of 1e-2 m, 5 Hz and below, and its tendons have corners
+    assert_allclose(at.position[np.isin(odd, t)], log.tip_position, atol=1e-4)
+
+
+def test_a_payload_is_a_mass_at_the_tip() -> None:
+    """The log's payload moves as a lump of the robot does; one that changes within a run is refused."""
+    log = recorded(robot(mass=0.03), {"a": 3}, np.arange(30) * 0.01, 0.0, step=1e-3)
+    loaded = replace(log, payload=np.full(len(log), 0.01))
+    assert_allclose(replay(loaded, robot(mass=0.02), dynamics=True).tip_position, log.tip_position, atol=1e-9)
+    with pytest.raises(LogError, match="payload changes within run 'a'"):
+        replay(replace(log, payload=np.linspace(0.0, 0.01, len(log))), robot(), dynamics=True)
+
+
+def test_what_cannot_be_fitted_is_refused() -> None:
+    log = recorded(robot(), {"a": 3}, np.arange(50) * 0.01, 0.0, step=1e-3)
+    for target in ("segment.1.damping_time", "segment.*.shear_stiffness", "segment.1.lump.1.mass"):
+        with pytest.raises(RobotError, match="fitted in motion; identify with --dynamics"):
+            base_model(robot(fit={target: {"sd": 1.0}}))
+    with pytest.raises(RobotError, match="have 1 lumps, counted from 1"):
+        base_model(robot(fit={"segment.1.lump.2.mass": {"sd": 1.0}}), dynamics=True)
+    stiff = robot(axial=np.inf, fit={"segment.1.axial_stiffness": {"sd": 1.0}})
+    with pytest.raises(RobotError, match="no value to begin from"):
+        base_model(stiff, dynamics=True)
+    with pytest.raises(InputError, match="needs a mass"):
+        replay(log, robot(density=0.0), dynamics=True)
+    with pytest.raises(InputError, match="network=True is for a log at rest"):
+        identify(log, robot(), dynamics=True, network=True)
+
+
+def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant = robot()
+    log = recorded(plant, {"a": 3}, np.arange(30) * 0.01, 0.0, step=1e-3)
+    save_robot(plant, tmp_path / "moving.toml")
+    write_log(log, tmp_path / "log.csv")
+    words = ["replay", str(tmp_path / "log.csv"), "--robot", str(tmp_path / "moving.toml")]
+    assert main([*words, "--dynamics", "--out", str(tmp_path / "out")]) == 0
+    shown = capsys.readouterr().out
+    assert "the model is in motion" in shown
+    assert (tmp_path / "out" / "residuals.csv").is_file()
