@@ -1,4 +1,5 @@
-"""The rod solver's figures: a pass, its arithmetic, full solves beside scipy, PyElastica, memory, start."""
+"""The rod solver's figures: a pass, its arithmetic, rods of modes, full solves beside scipy, PyElastica,
+memory, start."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ import cases
 import flops
 import peer_elastica
 import peer_fastrod
+import rod_modal
 import rod_solves
 from bench_peers import timed
 from cases import Case, TipError
@@ -200,6 +202,8 @@ def measure(options: Any) -> list[Section]:
         time_section(rows, n_robots),
         lag_section(rows),
         arithmetic_section(rows, n_robots),
+        rod_modal.step_section(min(n_robots, 1024), rounds=1 if quick else 3),
+        rod_modal.real_time_section(64 if quick else 1024, steps=20 if quick else 200),
         rod_solves.solve_section(paths, 512 if quick else n_robots, quick),
         rod_solves.path_section(paths, 10 if quick else 60),
         cantilever_section(),

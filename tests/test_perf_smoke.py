@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
@@ -60,6 +61,21 @@ def test_the_count_of_operations_is_linear_in_the_steps() -> None:
     (at_five,) = flops.counted(["paper", "prototype"], True, [5])
     assert flops.count({"paper": 5, "prototype": 5}, True) == at_five
     assert all(tally.flops > 1e4 for tally in at_five.values())
+
+
+def test_the_observer_and_rods_of_modes_are_measured_on_the_same_inputs() -> None:
+    import rod_modal
+
+    rows = rod_modal.step_section(3, rounds=1).rows
+    assert [row["robot"] for row in rows] == ["prototype"] * 10 + ["reacher"] * 10
+    assert {row["ok"] for row in rows} == {1.0}
+    for row in rows:
+        assert ("error_max_m" in row) is ("in motion" not in row["solver"])
+        assert row.get("error_max_m", 0.0) < (1e-3 if "(4, 2)" in row["solver"] else 1e-5), row
+        assert ("ratio" in row) is ("observer" not in row["solver"])
+    one, _ = rod_modal.real_time_section(3, steps=2).rows
+    assert one["factor"] == pytest.approx(1e3 * rod_modal.DT / one["ms"])
+    assert one["lost"] == 0
 
 
 def test_rows_become_json_and_a_table(capsys: pytest.CaptureFixture[str]) -> None:
@@ -309,3 +325,31 @@ def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str])
     assert all(row["rate"] > 0.0 for row in [*reach, *others])
     assert all(0.0 < row["fraction"] < 1.0 for row in reach if row["kind"] == "native batch")
     assert {row["kind"] for row in others} == set(fastrod_envs.names()) - {"Reach"}
+
+
+def test_heavy_upright_robots_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    import motion_steps
+
+    monkeypatch.setattr(motion_steps, "N_ROBOTS", 3)
+    count = motion_steps.run(True, 1e-3, 3 * 40, 1, math.inf)
+    assert (count.steps, count.lost, count.not_finite) == (120, 0, 0)
+    assert count.passes >= count.steps
+    assert count.holds > 0
+    assert count.grown <= count.holds
+    assert math.isfinite(count.growth + count.peak)
+
+
+def test_the_energy_that_the_campaign_counts_is_kept() -> None:
+    """Second order: a quarter of a millisecond leaves some 1e-4 of what goes from bend to motion and back."""
+    import motion_steps
+    from fastrod import Simulator
+
+    robot = motion_steps.upright(False)
+    sim, rest = Simulator(robot, 1, 2.5e-4, 8, dynamics=True, rho=0.9), robot.rest_tendon_length
+    states = [sim.settle(rest, tip_force=(0.4, 0.0, 0.0)), *(sim.step(rest) for _ in range(400))]
+    energy = np.array([motion_steps.energy(robot, state)[0] for state in states])
+    kinetic, bend = (
+        np.array([getattr(state, f"{k}_energy")[0] for state in states]) for k in ("kinetic", "strain")
+    )
+    assert np.ptp(energy) < 1e-3 * kinetic.max()
+    assert np.ptp(energy - kinetic - bend) > 0.1 * kinetic.max()  # tendons and weight have their fraction
