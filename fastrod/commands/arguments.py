@@ -526,12 +526,13 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
         metavar="N",
         help="radius of the ball of tip forces (default: 2 EI/l^2 of the robot)",
     )
-    shapes.add_argument(
-        "--line-density",
-        type=float,
-        metavar="KG/M",
-        help="mass per length, for the self-weight (default: the robot's)",
-    )
+    for kind, what in ((shapes, "for the self-weight"), (rollouts, "for self-weight and inertia")):
+        kind.add_argument(
+            "--line-density",
+            type=float,
+            metavar="KG/M",
+            help=f"{'robot: ' if kind is rollouts else ''}mass per length, {what} (default: the robot's)",
+        )
     shapes.add_argument(
         "--tolerance", type=float, metavar="M", help="largest boundary residual (default: 1e-6)"
     )
@@ -557,6 +558,13 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     _add_options(rollouts)
     rollouts.add_argument("--steps", type=int, metavar="N", help="robot: of an episode (default: 200)")
     rollouts.add_argument("--dt", type=float, metavar="S", help="robot: time step (default: 0.02)")
+    rollouts.add_argument(
+        "--dynamics",
+        action="store_const",
+        const=True,
+        help="robot: with inertia, so that it rings; rows have the tip's velocity, too. It needs a mass: the "
+        "robot file's line_density, or --line-density",
+    )
     rollouts.add_argument(
         "--bend", type=float, metavar="RAD", help="robot: largest bend of a segment (default: 0.9)"
     )
