@@ -203,6 +203,18 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         action="store_true",
         help="begin with the robot's demo motion; scenes always begin with their script",
     )
+    view.add_argument(
+        "--dynamics",
+        action="store_true",
+        help="a robot with inertia: pull its tip, let go, and it rings; in slow motion if you like",
+    )
+    view.add_argument(
+        "--line-density",
+        type=float,
+        metavar="KG/M",
+        help="with --dynamics: mass per length of all segments (default: the robot's)",
+    )
+    view.add_argument("--dt", type=float, metavar="S", help="with --dynamics: time step (default: 0.001 s)")
     view.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
     view.add_argument(
         "--host",
