@@ -19,7 +19,7 @@ FARTHEST_PULL = 0.25
 _STIFFER = 10.0  # the spring of a drag, times the tip's stiffness in its softest direction, at most
 _SLOW = 0.25  # of that stiffness, times the square of the first mode's angle in a step: more grows by itself
 _FEWEST, _ENOUGH = 10.0, 20.0  # steps in a period: fewer are refused, or taken only where asked for
-_HAND = 0.3  # of critical damping, of rod and spring together: a hand takes energy, too
+_DAMPED = 0.3  # of critical damping, of rod and spring together: a hand takes energy, too
 _STILL = 1e-5  # of the robot's length: amplitude below which nobody sees a rod ring
 _USUAL = 1e-3  # s of a step
 _FEW = 5  # steps at least in which a rod is still
@@ -44,7 +44,7 @@ class Ringing:
         self.stiffness = stiffer * softest
         """Of the drag's spring [N/m]."""
         together = 2.0 * math.pi * self.frequency * math.sqrt(1.0 + stiffer)
-        self.damping = self.stiffness * (simulator.dt + 2.0 * _HAND / together)
+        self.damping = self.stiffness * (simulator.dt + 2.0 * _DAMPED / together)
         """Of its damper [N s/m]."""
         self._farthest = FARTHEST_PULL * simulator.robots[0].length
         self._dt = simulator.dt
