@@ -206,6 +206,9 @@ def _view(arguments: argparse.Namespace) -> int:
         open_browser=not arguments.no_open,
         script=arguments.play,
         server=server,
+        dynamics=arguments.dynamics,
+        line_density=arguments.line_density,
+        dt=arguments.dt,
     )
     return DONE
 
