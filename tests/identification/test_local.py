@@ -13,8 +13,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
-from fastrod.identification.log.unknowns import Model, base_model
+from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 
 N = 40

@@ -14,10 +14,10 @@ from fastrod import Robot, Segment, Simulator, Tendon, save_robot
 from fastrod.commands.cli import main
 from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay
 from fastrod.identification.log.replay import replay
-from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Lump
