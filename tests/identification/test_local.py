@@ -169,7 +169,7 @@ def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
     before = here.rod.runs
     here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
-    assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
+    assert here.rod.runs - before <= 4 + 3  # at most what `by_length` and `by_force` took, once
     assert_slopes(here, model, theta, first, TENDONS | CAMERA | FORCE | MEMORY)
 
 

@@ -17,8 +17,8 @@ from fastrod.identification.log.unknowns import ADDED, SEGMENT_UNITS, TENDON_UNI
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 
-MOTION = ("damping_time", "axial_stiffness", "shear_stiffness", "mass")
-"""Parameters that only a fit in motion changes."""
+MOTION = ("damping_time",)
+"""Parameters that only motion shows."""
 _POSITIVE = (
     "length",
     "bending_stiffness",
