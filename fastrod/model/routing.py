@@ -65,11 +65,11 @@ class Routing:
 
 def _times(a: Floats, matrix: Floats) -> Floats:
     """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be
-    its robots bit by bit."""
-    out = np.zeros((*a.shape[:-1], matrix.shape[1]))
-    for i, row in enumerate(matrix):
-        out += a[..., i, None] * row
-    return out
+    its robots bit by bit. The rows are the last axis meanwhile, for there are many of them."""
+    out = np.zeros((matrix.shape[1], *a.shape[:-1]))
+    for column, row in zip(np.moveaxis(a, -1, 0), matrix, strict=True):
+        out += row.reshape(-1, *[1] * column.ndim) * column
+    return np.ascontiguousarray(np.moveaxis(out, 0, -1))
 
 
 def route(robot: Robot) -> Routing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -230,9 +231,10 @@ class ModalSolver:
     def settle(
         self, rows: Ints, ports: Ports, shape: RodShape, moving: MotionShape, tolerance: float, scheme: int
     ) -> Flags:
-        """Bring these robots to rest from where they are; who arrived. `tolerance` [m] at the tip."""
-        bend = tolerance / float(np.max(self.params.rod_length))
-        self._run(rows, ports, shape, moving, Step(REST, 1.0), None, (max(bend, 1e-13), 2, _MOST), scheme)
+        """Bring these robots to rest from where they are; who arrived. `tolerance` [m] at the tip; with inf
+        by one Newton step, which near a rest is exact to first order."""
+        bend, least = tolerance / float(np.max(self.params.rod_length)), 1 if math.isinf(tolerance) else 2
+        self._run(rows, ports, shape, moving, Step(REST, 1.0), None, (max(bend, 1e-13), least, _MOST), scheme)
         return np.asarray(self.iterations[rows] > 0)
 
     def step(

@@ -168,8 +168,8 @@ class Statics:
     ) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a
         whole log themselves. `params` may have a row for each robot; `robot` has the numbers of rods of modes
-        that are not among them: mass, lumps, stretch and shear. Robots that are not in `rows` are not solved,
-        and not `ok`."""
+        that are not among them: mass, lumps, stretch and shear. With `tolerance` inf those take one Newton
+        step, exact to first order. Robots that are not in `rows` are not solved, and not `ok`."""
         self._use_numbers(robot)
         self._reader.problems, self._derived = {}, None
         self._passes.params, self._bare = params, None

@@ -6,6 +6,7 @@ one robot of a batch, and only those samples are solved that the loss looks at.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -24,6 +25,8 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.inputs import Inputs, Reader
+from fastrod.solver.modal import Modes
+from fastrod.solver.motion import solver_of
 from fastrod.types import Flags, Floats, Ints, Params, Ports
 
 TOLERANCE = 1e-8  # of the robot's length: far below any camera
@@ -31,6 +34,7 @@ TOLERANCE = 1e-8  # of the robot's length: far below any camera
 # hundreds of them)
 _LOST = 500
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
+MODES = Modes(4, 2)  # of rods that need modes, as far off
 
 
 class PredictedPose(NamedTuple):
@@ -101,6 +105,7 @@ class PredictedRod:
             n_robots=n,
             points_per_segment=N_STEPS,
             outputs="full" if self.points else "tip",
+            modes=MODES if solver_of([bare], None, False) == "modal" else None,
             threads=threads,
         )
         self._tolerance = TOLERANCE * robot.length
@@ -110,14 +115,16 @@ class PredictedRod:
         self.cost = 0.0
         """Passes of a row so far, on the average."""
 
-    def solve(self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None) -> PredictedPose:
-        """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is
-        given."""
+    def solve(
+        self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None, near: bool = False
+    ) -> PredictedPose:
+        """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is given.
+        `near` ones differ so little from the last that a difference of first order is all that counts."""
         self.runs += 1
         state = self._sim.settle_ports(
             ports,
             params,
-            self._tolerance,
+            math.inf if near and self._sim.solver == "modal" else self._tolerance,
             None if rows is None or rows.all() else np.flatnonzero(rows),
             replace(robot, effects=()),
         )

@@ -156,7 +156,7 @@ class LinearisedModel:
         if force is not None:
             opened.tip_force = force
         self.rod.back(self._kept)
-        pose = self.rod.solve(*self.prepared.kernel(opened), self.robot, self.pose.ok)
+        pose = self.rod.solve(*self.prepared.kernel(opened), self.robot, self.pose.ok, near=True)
         opened.tendon_length, opened.tip_force = before
         return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
 
@@ -241,7 +241,8 @@ class LinearisedModel:
                 else prepare_log(self.samples, robot, model.wiring)
             )
             self.rod.back(self._kept)
-            pose = self.rod.solve(*place.kernel(place.drive(effects_at(model, moved))), robot, self.pose.ok)
+            driven = place.kernel(place.drive(effects_at(model, moved)))
+            pose = self.rod.solve(*driven, robot, self.pose.ok, near=True)
             self._columns[unknown.place] = np.where(pose.ok[:, None], self._difference(pose) / step, 0.0)
         return self._columns[unknown.place]
 
