@@ -298,6 +298,7 @@ JACOBIANS: list[Table] = [
     {"name": "axial_compression", "per_bend": [0.05, 0.1], "common_share": [0.5, 0.9]},
     {"name": "stiffening", "cubic": [0.2, 0.1]},
     {"name": "compression_softening", "gain": 40.0},
+    {"name": "tendon_interaction", "slope": [20.0, -10.0, 10.0, 5.0], "pair": 10.0, "next": 500.0},
 ]
 
 

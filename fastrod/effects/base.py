@@ -20,7 +20,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from sys import float_info
-from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 Per = Literal["robot", "segment", "drive"]
+Of = Literal["", "offset", "length", "1/offset", "1/offset^2"]
 
 
 class Seam(Enum):
@@ -82,9 +83,9 @@ class Parameter:
     per: Per = "robot"
     """One value for the robot, for each segment, or for each drive (a tendon, or an antagonistic pair of
     tendons)."""
-    of: Literal["", "offset", "length"] = ""
-    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone, or
-    the robot's length."""
+    of: Of = ""
+    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone,
+    one over it or over its square, or the robot's length."""
     shape: bool = False
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
     own."""
@@ -97,10 +98,11 @@ class Parameter:
                 f"its bounds {low} to {high}."
             )
         given: str = self.of  # a law of somebody's package may say anything
-        if given not in ("", "offset", "length"):
+        if given not in get_args(Of):
             old = " ('reach' is called 'offset' now)" if given == "reach" else ""
             raise EffectError(
-                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length' or ''{old}."
+                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length', '1/offset', "
+                f"'1/offset^2' or ''{old}."
             )
         if self.typical is None:
             span = 0.1 * (high - low)
@@ -119,7 +121,7 @@ class Parameter:
             float(routing.length.sum())
             if self.of == "length" or not routing.n_tendons
             else float(routing.tendon_offset.mean())
-        )
+        ) ** {"1/offset": -1, "1/offset^2": -2}.get(self.of, 1)
         assert self.typical is not None
         return Parameter(
             self.name,
@@ -178,6 +180,8 @@ class Law:
     """A robot with fewer segments cannot show it."""
     frequent: ClassVar[bool] = False
     """Met on many robots: where nothing was found, its bound comes first."""
+    last_resort: ClassVar[bool] = False
+    """A form without a cause, wide enough to stand in for others: tried where no other effect is found."""
 
 
 def trait(what: Effect, name: str) -> Any:

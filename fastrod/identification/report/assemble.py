@@ -328,13 +328,16 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
         ]
         return SearchStage(name=name, train=errors[0], held_out=errors[1])
 
-    stages = [stage("base", explained.start)]
-    for i in range(1, len(explained.names) + 1):
-        piece = explained.state
-        for name in explained.names[i:]:
-            piece = explained.search.without(piece, name)
-        stages.append(stage(explained.names[i - 1], piece))
-    return stages
+    stages, noise = [stage("base", explained.start)], base.noise.sigma
+    # as the search finds them: taken away from the whole model one by one, effects that correct each other
+    # leave a fit that starts far from where it should end
+    search, piece = explained.search.weighed(explained.start, noise)
+    for name in explained.names[:-1]:
+        added = search.candidate(piece, name).state
+        if added is not None:
+            search, piece = search.weighed(search.refined(added), noise)
+        stages.append(stage(name, piece))
+    return [*stages, *(stage(name, explained.state) for name in explained.names[-1:])]
 
 
 def limits(robot: Robot, samples: LogSamples) -> list[str]:

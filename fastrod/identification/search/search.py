@@ -351,12 +351,26 @@ class Search:
         ]
 
     def stage(self, state: ModelState, *, with_alternatives: bool = True) -> SearchStep:
-        """Try everything beside `state`; take the best, if any passes."""
+        """Try everything beside `state`; take the best, if any passes. Effects of last resort are tried where
+        no other passes: they could stand in for several."""
+        names = self.names(state)
+        last = [name for name in names if trait(get_effect(name), "last_resort")]
+        tried = self._tried(state, [name for name in names if name not in last])
+        step = self.choose(state, tried, with_alternatives=with_alternatives)
+        if not last or (step.taken is not None and step.taken.alternative is None):
+            return step
+        more = self.choose(state, self._tried(state, last), with_alternatives=False)
+        every = (*step.candidates, *more.candidates)
+        if more.taken is None or (step.taken is not None and _clearly_better(step.taken, more.taken)):
+            return replace(step, candidates=every)
+        return replace(more, candidates=every)
+
+    def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
         tried = []
-        for name in self.names(state):
+        for name in names:
             self.report(name)
             tried.append(self.candidate(state, name))
-        return self.choose(state, tried, with_alternatives=with_alternatives)
+        return tried
 
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
@@ -387,10 +401,7 @@ class Search:
             others = self.alternative_candidates(state)
             tried += others
             alternative = best_of([c for c in others if c.passes])
-        if alternative is not None and (
-            best is None
-            or (advantage(alternative, best) > BIC_RIVAL and z_between(alternative, best) > Z_RIVAL)
-        ):
+        if alternative is not None and (best is None or _clearly_better(alternative, best)):
             return SearchStep(state, tuple(tried), alternative)
         if best is None:
             return SearchStep(state, tuple(tried), None)
@@ -507,6 +518,10 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _clearly_better(one: Candidate, other: Candidate) -> bool:
+    return advantage(one, other) > BIC_RIVAL and z_between(one, other) > Z_RIVAL
 
 
 def _unfitted(name: str, why: str, n_parameters: int = 0) -> Candidate:
