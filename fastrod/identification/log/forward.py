@@ -21,7 +21,7 @@ from fastrod.identification.log.unknowns import Model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing
+from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Flags, Floats, Ints, Params, Ports
@@ -211,14 +211,16 @@ class PreparedLog:
 
 
 def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
-    """The inputs of the rows of `samples` for `robot`."""
+    """The inputs of the rows of `samples` for `robot`, its tendons grouped into drives as in `wiring`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     reader = Reader(layout, params, rest, len(log))
     ports = reader.ports(Inputs(**dict[str, Any](inputs(log, robot))))
     return PreparedLog(
         robot,
-        wiring,
+        # the arms of this robot: where offsets are fitted, a bend in an effect is by these, as it will be in
+        # the robot file
+        replace(route(robot), drive=wiring.drive, drive_sign=wiring.drive_sign),
         samples,
         ports,
         params,
