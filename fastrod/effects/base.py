@@ -89,6 +89,9 @@ class Parameter:
     shape: bool = False
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
     own."""
+    shared: bool = False
+    """Of one per drive. True: drives are alike unless one is worn, so a fit has one number for all, or one
+    drive alone."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -133,6 +136,7 @@ class Parameter:
             self.per,
             "",
             self.shape,
+            self.shared,
         )
 
     @property
@@ -336,7 +340,8 @@ def read_values(name: str, given: Mapping[str, object], routing: Routing, where:
     """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
     neutral.
 
-    A number stands for all segments or drives, a list for each. Raises `EffectError` for what cannot be.
+    A number stands for all segments or drives, a list for each; a `shared` parameter of drives takes a list
+    for each segment too, where drives and segments are not as many. Raises `EffectError` for what cannot be.
     """
     what = get_effect(name)
     known = [p.name for p in what.parameters]
@@ -350,6 +355,9 @@ def read_values(name: str, given: Mapping[str, object], routing: Routing, where:
         value = given.get(parameter.name, parameter.neutral)
         count = routing.count(parameter.per)
         listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
+        if parameter.shared and len(listed) == routing.n_segments != count:
+            ends = dict(zip(routing.drive.tolist(), routing.tendon_segment.tolist(), strict=True))
+            listed = [listed[ends[drive]] for drive in range(count)]
         if len(listed) != count:
             raise EffectError(
                 f"{where}: {parameter.name} of effect {name!r} has {len(listed)} values; give one, or "

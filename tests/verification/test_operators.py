@@ -16,7 +16,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, read_values
 from fastrod.effects.executor import SensedPoses
 from fastrod.effects.pipeline import EffectPipeline
 from fastrod.kernels.operators import (
@@ -166,7 +166,7 @@ def test_friction_grows_with_the_angle_that_a_tendon_wraps() -> None:
     # a bend of one radian in the end
     dl = np.linspace(0.0, 1.0, 50)[:, None] * (bend(robot, 0.8, 0.6) - robot.rest_tendon_length)
     table = {"half_width": 2e-4, "presliding": 1e-4, "growth": 0.7, "spread": 0.0}
-    values = np.array([[*table.values()]])
+    values = read_values("friction", table, route(robot), "test")[None]
     what: Any = get_effect("friction")
     lost = dl - what.sweep(values, what.memory(1, 4), dl[None], np.full(50, 0.1), route(robot))[0]
     assert_allclose(np.abs(lost[-1]), 2e-4 * 1.7, rtol=1e-12)
@@ -687,7 +687,7 @@ def test_an_effect_on_the_tendons_is_its_operator_on_what_bends(name: str, value
     robot = rod()
     path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
     what: Any = get_effect(name)
-    row = np.array([[values.get(p.name, p.neutral) for p in what.parameters]])
+    row = read_values(name, values, route(robot), "test")[None]
     dl = path - robot.rest_tendon_length
     moved = what.sweep(row, what.memory(1, 4), dl[None], np.full(12, 0.05), route(robot))[0]
     sim, base = Simulator(having(robot, name, **values), dt=0.05), Simulator(robot, dt=0.05)

@@ -178,24 +178,44 @@ class Search:
 
     def candidate(self, state: ModelState, name: str) -> Candidate:
         """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
-        its passes."""
+        its passes. Where it could be one drive's, and this log shows that it is, of that drive alone."""
         if self.spent:
             return _unfitted(name, "not tried: the model hardly converges on this log")
-        drop = self._unseen(state, name)
-        added = state.model.with_effect(name).unknowns[len(state.model.unknowns) :]
+        shared = self._candidate(state, name)
+        drive = self._drive(state, name)
+        if drive is None:
+            return shared
+        alone = self._candidate(state, name, drive)
+        return alone if alone.passes and _distinct(alone, shared) else shared
+
+    def _drive(self, state: ModelState, name: str) -> int | None:
+        """The drive by which alone an effect promises most; None where drives do not differ by it."""
+        count = state.model.wiring.n_drives
+        if count < 2 or not any(p.shared for p in get_effect(name).parameters):
+            return None
+        promises = []
+        for drive in range(count):
+            model = state.model.with_effect(name, drive=drive)
+            promises.append(max(self._promise(state, model, theta) for theta in _starts(state, model, name)))
+        best = int(np.argmax(promises))
+        return best if promises[best] >= _SCREEN * state.fit.loss else None
+
+    def _candidate(self, state: ModelState, name: str, drive: int | None = None) -> Candidate:
+        drop = self._unseen(state, name, drive)
+        added = state.model.with_effect(name, drive=drive).unknowns[len(state.model.unknowns) :]
         if all(u.name.partition(".")[2] in drop for u in added if not u.shape):
             shown_by = trait(get_effect(name), "excited_by") or "no response"
             return _unfitted(name, f"this log does not excite it: {shown_by}")
-        model = state.model.with_effect(name, drop=drop)
+        model = state.model.with_effect(name, drop=drop, drive=drive)
         fits = self._from_starts(state, model, name)
         if fits is None:
             n_more = len(model.unknowns) - len(state.model.unknowns)
             return _unfitted(name, "its slopes promise nothing", n_more)
         return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
-    def _unseen(self, state: ModelState, name: str) -> list[str]:
+    def _unseen(self, state: ModelState, name: str, drive: int | None) -> list[str]:
         """Size parameters of an effect that this log does not move at all: left at neutral."""
-        model = state.model.with_effect(name)
+        model = state.model.with_effect(name, drive=drive)
         n = len(state.model.unknowns)
         theta = np.concatenate([state.theta, model.start[n:]])
         at_zero = theta.copy()
@@ -215,36 +235,8 @@ class Search:
 
     def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
         linearised, n = state.linearised, len(state.model.unknowns)
-        added = model.unknowns[n:]
-        starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
-        # per-segment and per-drive columns share their parameter's starts
-        own = [
-            starts[
-                next(
-                    key
-                    for key in sorted(starts, key=len, reverse=True)
-                    if u.name.partition(".")[2].startswith(key)
-                )
-            ]
-            for u in added
-        ]
-        grouped = list(dict.fromkeys(tuple(s) for s in own))
-        combos = list(product(*grouped))[: 2 * _STARTS]
-        combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
         amplitudes = state.fit.theta[n:]
-        promising = []
-        for combo in combos:
-            pick = dict(zip(grouped, combo, strict=True))
-            theta = np.concatenate(
-                [
-                    state.theta,
-                    [
-                        u.outside(float(np.clip(pick[tuple(s)], *u.bounds)))
-                        for u, s in zip(added, own, strict=True)
-                    ],
-                ]
-            )
-            promising.append((self._promise(state, model, theta), theta))
+        promising = [(self._promise(state, model, theta), theta) for theta in _starts(state, model, name)]
         promising.sort(key=lambda pair: -pair[0])
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
@@ -518,6 +510,39 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
+    """Where fits of `model` begin, which has an effect more than `state`: its parameters' starts."""
+    added = model.unknowns[len(state.model.unknowns) :]
+    starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
+    # per-segment and per-drive columns share their parameter's starts
+    own = [
+        starts[
+            next(
+                key
+                for key in sorted(starts, key=len, reverse=True)
+                if u.name.partition(".")[2].startswith(key)
+            )
+        ]
+        for u in added
+    ]
+    grouped = list(dict.fromkeys(tuple(s) for s in own))
+    combos = list(product(*grouped))[: 2 * _STARTS]
+    combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
+    made = []
+    for combo in combos:
+        pick = dict(zip(grouped, combo, strict=True))
+        begin = [
+            u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)
+        ]
+        made.append(np.concatenate([state.theta, begin]))
+    return made
+
+
+def _distinct(alone: Candidate, shared: Candidate) -> bool:
+    """Whether blocks and evidence say that an effect is one drive's and not every drive's."""
+    return shared.state is None or _clearly_better(alone, shared)
 
 
 def _clearly_better(one: Candidate, other: Candidate) -> bool:
