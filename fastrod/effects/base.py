@@ -186,6 +186,9 @@ class Law:
     """Met on many robots: where nothing was found, its bound comes first."""
     last_resort: ClassVar[bool] = False
     """A form without a cause, wide enough to stand in for others: tried where no other effect is found."""
+    refines: ClassVar[str] = ""
+    """Another effect of the same cause: tried wherever that one is, and named only where the log tells the
+    two laws apart."""
 
 
 def trait(what: Effect, name: str) -> Any:

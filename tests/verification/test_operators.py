@@ -659,6 +659,12 @@ def test_what_the_camera_makes_of_the_tip() -> None:
         assert_allclose(found[:2], true[:2] * (1.0 + 0.2 * (true[:2] @ true[:2]) / 0.07**2), rtol=1e-14)
         assert found[2] == true[2]
 
+    settling = {"x": 2e-3, "y": 0.0, "z": -1e-3, "time_constant": 2.5}
+    drifting = Simulator(having(robot, "settling_drift", **settling), dt=0.5, points_per_segment=8)
+    for k in range(4):  # of the whole way, 1 - 1/e after one time constant
+        drifting.settle(lengths, tolerance=1e-12, **given)
+        way = 1.0 - np.exp(-0.5 * k / 2.5)
+        assert_allclose(drifting.measure().tip_position[0], r + way * np.array([2e-3, 0.0, -1e-3]), atol=1e-9)
     drifting = Simulator(having(robot, "time_drift", x=1e-5, y=0.0, z=-2e-5), dt=0.5, points_per_segment=8)
     for k in range(3):
         drifting.settle(lengths, tolerance=1e-12, **given)

@@ -178,15 +178,20 @@ class Search:
 
     def candidate(self, state: ModelState, name: str) -> Candidate:
         """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
-        its passes. Where it could be one drive's, and this log shows that it is, of that drive alone."""
+        its passes. Where this log shows that it is one drive's, of that drive alone; where it shows another
+        law of the same cause, that law."""
         if self.spent:
             return _unfitted(name, "not tried: the model hardly converges on this log")
-        shared = self._candidate(state, name)
-        drive = self._drive(state, name)
-        if drive is None:
-            return shared
-        alone = self._candidate(state, name, drive)
-        return alone if alone.passes and _distinct(alone, shared) else shared
+        best = self._candidate(state, name)
+        laws = [name, *(other for other in effect_names() if trait(get_effect(other), "refines") == name)]
+        variants: list[tuple[str, int | None]] = [(law, None) for law in laws[1:] if law not in self.excluded]
+        for law in laws:
+            drive = self._drive(state, law)
+            variants += [] if drive is None else [(law, drive)]
+        for law, drive in variants:
+            other = self._candidate(state, law, drive)
+            best = other if other.passes and _distinct(other, best) else best
+        return best
 
     def _drive(self, state: ModelState, name: str) -> int | None:
         """The drive by which alone an effect promises most; None where drives do not differ by it."""
@@ -333,10 +338,13 @@ class Search:
     def names(self, state: ModelState) -> list[str]:
         """Effects that may be tried."""
         n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
+        refined = {trait(get_effect(name), "refines") for name in state.model.effects}
         return [
             name
             for name in effect_names()
             if name not in state.model.effects
+            and name not in refined
+            and not trait(get_effect(name), "refines")
             and name not in self.excluded
             and trait(get_effect(name), "least_segments") <= n_segments
             and (driven or get_effect(name).seam.name != "ACTUATION")
@@ -540,9 +548,9 @@ def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
     return made
 
 
-def _distinct(alone: Candidate, shared: Candidate) -> bool:
-    """Whether blocks and evidence say that an effect is one drive's and not every drive's."""
-    return shared.state is None or _clearly_better(alone, shared)
+def _distinct(one: Candidate, other: Candidate) -> bool:
+    """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
+    return other.state is None or _clearly_better(one, other)
 
 
 def _clearly_better(one: Candidate, other: Candidate) -> bool:
