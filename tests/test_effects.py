@@ -373,7 +373,7 @@ WRONG: list[tuple[Any, ...]] = [
         "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive",
         {"name": "drum_gain", "gain": [0.1, 0.2]},
     ),
-    ("has 2 values; give one", creep(share=[0.1, 0.2])),
+    ("has 3 values; give one", creep(share=[0.1, 0.2, 0.3])),
     ("has effect 'payload' twice", {"name": "payload"}, {"name": "payload"}),
     ("has effect 'backlash' twice", lash(), {"name": "gear_play"}),
     ("has no name", {"half_width": 1e-4}),

@@ -186,6 +186,9 @@ class Law:
     """Met on many robots: where nothing was found, its bound comes first."""
     last_resort: ClassVar[bool] = False
     """A form without a cause, wide enough to stand in for others: tried where no other effect is found."""
+    feels_tip: ClassVar[bool] = False
+    """Its tip force depends on where the tip is, `ports.tip_position`. A step of a simulator goes by the last
+    state and the compliance of the rod there; `settle` and a log solve force and rod together."""
     refines: ClassVar[str] = ""
     """Another effect of the same cause: tried wherever that one is, and named only where the log tells the
     two laws apart."""

@@ -84,7 +84,7 @@ class EffectPorts:
     point_forces: list[tuple[Floats, Floats]] = field(default_factory=list)
     """Arclength (n,) [m] and force (n, 3) [N] of each that effects have added through `add_point_force`."""
     tip_position: Floats = field(default_factory=_none)
-    """SENSING only: (n, 3) base frame [m]."""
+    """SENSING, and effects that feel the tip, only: (n, 3) base frame [m]."""
     tip_rotation: Floats = field(default_factory=_none)
     """SENSING only: (n, 3, 3) base_from_tip."""
     points: Floats = field(default_factory=_none)

@@ -13,7 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fastrod.effects.base import Seam, has_memory
-from fastrod.effects.executor import Link, SensedPoses, act, from_base, link, sense, sweep
+from fastrod.effects.executor import (
+    Link,
+    SensedPoses,
+    act,
+    approached,
+    feels_tip,
+    from_base,
+    link,
+    sense,
+    sweep,
+    tip_feedback,
+)
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
@@ -30,6 +41,8 @@ TOLERANCE = 1e-8  # of the robot's length: far below any camera
 # passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some
 # hundreds of them)
 _LOST = 500
+_BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
+_FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 
 
@@ -180,8 +193,8 @@ class PreparedLog:
         )
 
     def drive(self, links: Sequence[Link]) -> EffectPorts:
-        """Ports of the rows after the effects of `links`, but for sensing. Up to the last one with a memory
-        they run over every sample, for the tendons' lengths."""
+        """Ports of the rows after the effects of `links`, less sensing and those that feel the tip. Up to the
+        last one with a memory they run over every sample, for the tendons' lengths."""
         opened, rest = self.open(), self.robot.rest_tendon_length
         swept = 1 + max((i for i, each in enumerate(links) if has_memory(each.effect)), default=-1)
         if swept:
@@ -196,6 +209,46 @@ class PreparedLog:
             opened.tendon_length = every.dl[self.samples.rows] + rest
         act([each.on(len(opened)) for each in links[swept:]], opened)
         return opened
+
+    def solve(
+        self, links: Sequence[Link], rod: PredictedRod, robot: Robot, rows: Flags | None = None
+    ) -> tuple[EffectPorts, PredictedPose]:
+        """Ports of the rows after the effects of `links`, those that feel the tip included, and the pose of
+        `robot` at these; only of the `rows` of a mask, where one is given. A row at which such a force and
+        the rod find no balance is not `ok`."""
+        felt = [each.on(len(self.samples.rows)) for each in links if feels_tip(each.effect)]
+        opened = self.drive(links)
+        pose = rod.solve(*self.kernel(opened), robot, rows)
+        if not felt:
+            return opened, pose
+        given, force = opened.tip_force, np.zeros_like(opened.tip_force)
+        kept = rod.keep()
+        step = _FORCE * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2
+        columns = []
+        for axis in np.eye(3):
+            opened.tip_force = given + step * axis
+            moved = rod.solve(*self.kernel(opened), robot, pose.ok)
+            columns.append(np.where(pose.ok[:, None], (moved.position - pose.position) / step, 0.0))
+            rod.back(kept)
+        opened.tip_force, by_force = given, np.stack(columns, axis=-1)
+        for _ in range(_BALANCE):
+            target, slopes = tip_feedback(felt, opened, pose.position)
+            now = approached(force, target, slopes, by_force)
+            change = np.where(pose.ok[:, None], now - force, 0.0)
+            expected = np.einsum("nij,nj->ni", by_force, change)
+            off = np.linalg.norm(expected, axis=1)
+            if not (off > TOLERANCE * robot.length).any():
+                break
+            force = force + change
+            opened.tip_force = given + force
+            before, pose = pose, rod.solve(*self.kernel(opened), robot, rows)
+            # what the rod did beyond its compliance corrects it along the change (Broyden 1965)
+            beyond = np.where(pose.ok[:, None], pose.position - before.position - expected, 0.0)
+            size = np.maximum((change**2).sum(1), 1e-30)
+            by_force = by_force + beyond[:, :, None] * (change / size[:, None])[:, None]
+        else:
+            pose = pose._replace(ok=pose.ok & (off <= 1e3 * TOLERANCE * robot.length))
+        return opened, pose
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
@@ -251,4 +304,4 @@ def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod)
     robot = model.robot_at(theta)
     place = prepare_log(samples, robot, model.wiring)
     links = effects_at(model, theta)
-    return place.see(rod.solve(*place.kernel(place.drive(links)), robot), links)
+    return place.see(place.solve(links, rod, robot)[1], links)
