@@ -261,7 +261,7 @@ class Simulator(Motions):
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
         state = self._settle(ports, read, tolerance, only)
-        return self._balanced(given, state, tolerance, only) if self._chain.feels_tip else state
+        return self._balanced(given, state, tolerance, only) if self._chain.follows else state
 
     def _contact_step(
         self,

@@ -189,6 +189,9 @@ class Law:
     feels_tip: ClassVar[bool] = False
     """Its tip force depends on where the tip is, `ports.tip_position`. A step of a simulator goes by the last
     state and the compliance of the rod there; `settle` and a log solve force and rod together."""
+    reads_tension: ClassVar[bool] = False
+    """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
+    solve it together with the rod."""
     refines: ClassVar[str] = ""
     """Another effect of the same cause: tried wherever that one is, and named only where the log tells the
     two laws apart."""
@@ -235,8 +238,14 @@ class Operator(Law, ABC):
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
-        dl = ports.tendon_length - ports.rest_length
-        ports.shift_tendons(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl)
+        dl = ports.dl
+        swept = self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl
+        ports.shift_tendons(self.change(values, swept, ports))
+
+    def change(self, values: Floats, swept: Floats, ports: EffectPorts) -> Floats:
+        """(n, n_tendons) by how much lengths change [m], from what `sweep` has changed: the same, unless it
+        takes what the ports have besides lengths."""
+        return swept
 
 
 _REGISTRY: dict[str, Effect] = {}

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.effects.base import Effect, Seam, get_effect, trait
+from fastrod.effects.base import Effect, Operator, Seam, get_effect, trait
 from fastrod.effects.ports import EffectPorts
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
@@ -66,6 +66,11 @@ def feels_tip(what: Effect) -> bool:
     return bool(trait(what, "feels_tip"))
 
 
+def reads_tension(what: Effect) -> bool:
+    """Whether an effect depends on the tension that tendons have."""
+    return bool(trait(what, "reads_tension"))
+
+
 def tip_feedback(links: Sequence[Link], opened: EffectPorts, tip: Floats) -> tuple[Floats, Floats]:
     """What effects that feel the tip do where it is at `tip` (n, 3), base frame [m]: their tip force (n, 3)
     [N] and its slopes by the tip (n, 3, 3) [N/m], force in the world frame. `opened` stays as it is."""
@@ -116,7 +121,12 @@ def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> 
             row.tendon_length = dl[i : i + 1] + rest
             one.effect.apply(one.values, memory, row, None, float(dt[i]))
             out[i] = row.dl[0]
-    opened.shift_tendons(out - dl)
+    change = out - dl
+    if isinstance(one.effect, Operator):
+        change = one.effect.change(
+            np.broadcast_to(one.values, (len(dl), one.values.shape[1])), change, opened
+        )
+    opened.shift_tendons(change)
 
 
 def sense(links: Iterable[Link], opened: EffectPorts, seen: SensedPoses, dt: float = 0.0) -> SensedPoses:

@@ -86,10 +86,13 @@ class EffectPipeline:
         self.pulls_tip = False
         """A force that depends on where the tip is has acted."""
         self._tip_links = [link for link in self.links if executor.feels_tip(link.effect)]
+        self._reads_tension = any(executor.reads_tension(link.effect) for link in self.links)
+        self._tension = np.zeros((n_robots, self.routing.n_tendons))
+        self._lengths: Floats | None = None
         self._before: list[Floats] = []
         self._cold = np.zeros(n_robots, bool)
         self.tip_step = np.zeros(n_robots)
-        """(n_robots,) by how much the tip is off from where the last force of `feels_tip` has put it [m]."""
+        """(n_robots,) by how much the rod is not yet where effects that follow it have put it [m]."""
         # of the whole rod, tendons free: its tip gives by no more
         self._softest = np.array(
             [
@@ -106,6 +109,11 @@ class EffectPipeline:
     def feels_tip(self) -> bool:
         """Whether an effect's force depends on where the tip is."""
         return bool(self._tip_links)
+
+    @property
+    def follows(self) -> bool:
+        """Whether an effect depends on what the rod does: on where its tip is, or its tendons' tension."""
+        return self.feels_tip or self._reads_tension
 
     def reset(self, rows: Any) -> None:
         """Let these robots begin at rest again."""
@@ -140,10 +148,26 @@ class EffectPipeline:
         else:
             self._cold = np.isnan(self.time)
             self.time = np.where(skip, self.time, np.where(self._cold, 0.0, self.time + dt))
-        before = [link.memory.copy() for link in self.links] if skip.any() or self._tip_links else []
+        before = [link.memory.copy() for link in self.links] if skip.any() or self.follows else []
         self._before = before
         opened = self._open(ports, params, n_steps)
+        if self._reads_tension:
+            cold = self._cold & (not again)
+            if state is not None and len(state.tension) != len(opened):
+                raise EffectError(
+                    "an effect goes by the tension of the tendons, which outputs='tip' leaves out; give "
+                    "Simulator(robot, outputs='full')."
+                )
+            if state is not None:
+                self._tension = np.where(np.isfinite(state.tension), state.tension, self._tension)
+            self._tension = np.where(cold[:, None], 0.0, self._tension)
+            opened.solved_tension = self._tension
         executor.act(self.links, opened, state, dt)
+        self.tip_step = np.zeros(len(opened))
+        if self._reads_tension:
+            if again and self._lengths is not None:
+                self.tip_step = np.abs(opened.tendon_length - self._lengths).max(1, initial=0.0)
+            self._lengths = opened.tendon_length.copy()
         if self._tip_links:
             self._feel(opened, state, compliance, self._cold if not again else np.zeros_like(skip))
         for link, old in zip(self.links, before, strict=bool(before)):
@@ -174,7 +198,7 @@ class EffectPipeline:
         self.pulls_tip = self.pulls_tip or bool(target.any() or slopes.any())
         before = memory[:, :3].copy()
         force = executor.approached(before, target, slopes, by_force)
-        self.tip_step = np.linalg.norm(by_force @ (force - before)[..., None], axis=(1, 2))
+        self.tip_step += np.linalg.norm(by_force @ (force - before)[..., None], axis=(1, 2))
         memory[:, :3] = force
         opened.tip_force += force
 

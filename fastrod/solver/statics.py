@@ -379,7 +379,7 @@ class Statics:
         return by_force
 
     def _balanced(self, given: Inputs, state: State, tolerance: float, only: Flags | None) -> State:
-        """The same settled again until the forces of effects that feel the tip are those where it is."""
+        """The same settled again until effects that follow the rod are those of where it is."""
         for _ in range(_BALANCE):
             ports, rows = self._read(given, only, again=True)
             off = np.zeros(self.n_robots)
@@ -388,7 +388,7 @@ class Statics:
                 return state
             state = self._settle(ports, rows, tolerance, only)
         lost = ~(off <= tolerance)
-        never = "settle found no balance of the rod with an effect's force that depends on where the tip is"
+        never = "settle found no balance of the rod with an effect that depends on its tip or its tension"
         problems = {int(i): ProblemSentence(f"{never}.", Problem.NOT_CONVERGED) for i in np.flatnonzero(lost)}
         self._state = replace(state, ok=state.ok & ~lost, problems=dict(state.problems) | problems)
         return self._state

@@ -131,7 +131,7 @@ class LinearisedModel:
         self.robot = model.robot_at(theta)
         self.prepared = prepare_log(samples, self.robot, model.wiring)
         self.effects = effects_at(model, theta)
-        self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot)
+        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot)
         self._feedback = self._tip_feedback(self.effects, self.pose.position)[0]
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
