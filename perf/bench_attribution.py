@@ -113,6 +113,8 @@ def score(kind: str, row: dict[str, Any]) -> bool:
     sets = [{name, *others} for name, others in zip(named, row["classes"], strict=True)]
     left = (row["after"] - row["floor"]) / max(row["before"] - row["floor"], 1e-9)
     first = bool(named) and named[:1] == true[:1]
+    if kind == "outside" and first:  # a pattern that an effect stands for: a slip
+        return True
     if kind in ("none", "outside"):
         return bool(verdict == {"none": "none", "outside": "not_in_library"}[kind])
     if kind == "two":

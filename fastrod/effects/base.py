@@ -189,6 +189,8 @@ class Law:
     feels_tip: ClassVar[bool] = False
     """Its tip force depends on where the tip is, `ports.tip_position`. A step of a simulator goes by the last
     state and the compliance of the rod there; `settle` and a log solve force and rod together."""
+    by_pattern: ClassVar[bool] = False
+    """A search tries it where the alternative pattern of its name fits: a scan finds where its fit begins."""
     reads_tension: ClassVar[bool] = False
     """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
     solve it together with the rod."""

@@ -27,6 +27,7 @@ from fastrod.types import Floats
 N = 30
 GIVEN: dict[str, dict[str, Any]] = {
     "latency": {"delay": 0.13},
+    "slip": {"step": [4e-4, 0.0, -3e-4, 0.0], "at": 0.7},
     "temperature": {"gain": 0.1, "time_constant": 20.0},
     "backlash": {"half_width": [3e-4, 5e-4], "rounding": 0.2},
     "friction": {"half_width": [4e-4, 3e-4], "presliding": 6e-4, "growth": 0.5, "spread": 0.7},

@@ -202,6 +202,8 @@ def effect_unknowns(
             begin = (start or {}).get(parameter.name, parameter.starts[0])
             log = parameter.shape and parameter.bounds[0] > 0.0
             mean = parameter.starts[len(parameter.starts) // 2] if parameter.shape else parameter.neutral
+            if parameter.shape and parameter.name in (start or {}):  # found otherwise
+                mean = begin
             sd = 1.5 if log else _WIDE * parameter.scale
             found.append(
                 Unknown(

@@ -182,6 +182,11 @@ class Search:
         law of the same cause, that law."""
         if self.spent:
             return _unfitted(name, "not tried: the model hardly converges on this log")
+        if trait(get_effect(name), "by_pattern"):
+            found = [
+                c for c in self.pattern_effects(state, self.alternative_candidates(state)) if c.name == name
+            ]
+            return found[0] if found else _unfitted(name, "no pattern of it fits")
         best = self._candidate(state, name)
         laws = [name, *(other for other in effect_names() if trait(get_effect(other), "refines") == name)]
         variants: list[tuple[str, int | None]] = [(law, None) for law in laws[1:] if law not in self.excluded]
@@ -333,6 +338,24 @@ class Search:
             made.append(self.judged(state, with_it, alternative.name, alternative))
         return made
 
+    def pattern_effects(self, state: ModelState, patterns: Sequence[Candidate]) -> list[Candidate]:
+        """The effects that stand for some of these patterns, each fitted from where its scan has found it."""
+        made = []
+        for candidate in patterns:
+            pattern = candidate.alternative
+            if pattern is None or pattern.start is None:
+                continue
+            name = pattern.name
+            if name in state.model.effects or name in self.excluded:
+                continue
+            model = state.model.with_effect(name, pattern.start, drive=pattern.drive)
+            n = len(state.model.unknowns)
+            theta = np.concatenate([state.theta, model.start[n:]])
+            fit = self._fit(state.linearised, model, theta, state.fit.theta[n:], state.alternatives, _MANY)
+            with_it = self._state(model, state.linearised, fit, state.alternatives)
+            made.append(self.judged(state, with_it, name))
+        return made
+
     # ------------------------------------------------------------ stages
 
     def names(self, state: ModelState) -> list[str]:
@@ -345,6 +368,7 @@ class Search:
             if name not in state.model.effects
             and name not in refined
             and not trait(get_effect(name), "refines")
+            and not trait(get_effect(name), "by_pattern")
             and name not in self.excluded
             and trait(get_effect(name), "least_segments") <= n_segments
             and (driven or get_effect(name).seam.name != "ACTUATION")
@@ -375,6 +399,10 @@ class Search:
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
         they beat it clearly."""
+        others = self.alternative_candidates(state) if with_alternatives else []
+        effects = self.pattern_effects(state, others)
+        tried = [*tried, *effects]
+        others = [c for c in others if not any(c.name == one.name and one.passes for one in effects)]
         fitted = sorted(
             (c for c in tried if c.state is not None and c.z > 1.0 and c.fraction > FRACTION_ACCEPT),
             key=lambda c: -c.fraction,
@@ -396,11 +424,8 @@ class Search:
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = best_of(passing)
-        alternative = None
-        if with_alternatives:
-            others = self.alternative_candidates(state)
-            tried += others
-            alternative = best_of([c for c in others if c.passes])
+        tried += others
+        alternative = best_of([c for c in others if c.passes])
         if alternative is not None and (best is None or _clearly_better(alternative, best)):
             return SearchStep(state, tuple(tried), alternative)
         if best is None:
