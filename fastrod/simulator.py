@@ -36,7 +36,7 @@ from fastrod.solver.response import stretch
 from fastrod.solver.state import Observer, Pose, State, check_on_robot
 from fastrod.solver.statics import DIVERGED
 from fastrod.solver.stepper import unloaded
-from fastrod.types import Floats
+from fastrod.types import Floats, Ports
 
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 
@@ -267,7 +267,8 @@ class Simulator(Motions):
         only = None if rows is None else robot_mask(rows, self.n_robots)
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
-        return self._settle(ports, read, tolerance, only)
+        state = self._settle(ports, read, tolerance, only)
+        return self._balanced(given, state, tolerance, only) if self._chain.follows else state
 
     def _refuse_follower_line(self, force: ArrayLike | None) -> None:
         if force is not None and self.solver != "modal":
@@ -380,12 +381,33 @@ class Simulator(Motions):
             return jacobian
         slopes = self._chain.slopes(self._bare, self._plain, self._state, self.dt, self._layout.n_steps)
         n = slopes.shape[1]
-        return np.concatenate([jacobian[:, :, :n] @ slopes, jacobian[:, :, n:]], axis=2)
+        jacobian = np.concatenate([jacobian[:, :, :n] @ slopes, jacobian[:, :, n:]], axis=2)
+        return self._with_feedback(jacobian, ports, turning) if self._chain.feels_tip else jacobian
+
+    def _with_feedback(self, jacobian: Floats, ports: Ports, turning: bool) -> Floats:
+        """A Jacobian at which the forces of effects that feel the tip were held, with them: they go by the
+        tip, and with the base where it rotates."""
+        state, bare = self._state, self._bare
+        assert state is not None
+        assert bare is not None
+        by_force = np.asarray(self._linear(ports).by_force())
+        force, slopes = self._chain.tip_feedback(bare, self._plain, state, self._layout.n_steps)
+        moved = np.zeros((len(force), 3, jacobian.shape[2]))
+        if turning:
+            arm = state.tip_position - ports.base_pose[:, :3]
+            for j, axis in enumerate(np.eye(3)):
+                rotated = slopes @ np.cross(axis, arm)[..., None]
+                moved[:, :, j - 3] = np.cross(axis, force) - rotated[..., 0]
+        inverse = np.linalg.inv(np.eye(3) - slopes @ by_force[:, :3])
+        change: Floats = jacobian + by_force @ inverse @ (slopes @ jacobian[:, :3] + moved)
+        return change
 
     def compliance(self) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation
         and contact forces held."""
-        return np.asarray(self._linear(self._last("compliance")[1]).by_force())
+        ports = self._last("compliance")[1]
+        by_force = np.asarray(self._linear(ports).by_force())
+        return self._with_feedback(by_force, ports, False) if self._chain.feels_tip else by_force
 
     def set_free(
         self,

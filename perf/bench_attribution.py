@@ -26,7 +26,7 @@ FIRST_SEED = 1000  # rules were set while looking at these; other seeds are a fa
 GOALS = {
     "single": (200, ">= 95 % right effect first; held-out <= 1.15 x floor"),
     "none": (100, ">= 98 % verdict none"),
-    "outside": (60, ">= 90 % not_in_library"),
+    "outside": (60, ">= 90 % not_in_library, a slip by its name"),
     "two": (60, ">= 90 % both named, up to class"),
     "dominant": (40, ">= 88 % dominant first, up to class"),
     "deleted": (60, "<= 15 % a sibling called the explanation that leaves > 15 % of the error"),
@@ -113,6 +113,8 @@ def score(kind: str, row: dict[str, Any]) -> bool:
     sets = [{name, *others} for name, others in zip(named, row["classes"], strict=True)]
     left = (row["after"] - row["floor"]) / max(row["before"] - row["floor"], 1e-9)
     first = bool(named) and named[:1] == true[:1]
+    if kind == "outside" and first:  # a pattern that an effect stands for: a slip
+        return True
     if kind in ("none", "outside"):
         return bool(verdict == {"none": "none", "outside": "not_in_library"}[kind])
     if kind == "two":

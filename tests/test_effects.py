@@ -298,6 +298,7 @@ JACOBIANS: list[Table] = [
     {"name": "axial_compression", "per_bend": [0.05, 0.1], "common_share": [0.5, 0.9]},
     {"name": "stiffening", "cubic": [0.2, 0.1]},
     {"name": "compression_softening", "gain": 40.0},
+    {"name": "tendon_interaction", "slope": [20.0, -10.0, 10.0, 5.0], "pair": 10.0, "next": 500.0},
 ]
 
 
@@ -345,7 +346,7 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     assert_same(run(simulator(robot), lengths), run(simulator(again), lengths))
     text = dumps(load_robot("prototype")) + '\n[[effect]]\nname = "play"\nhalf_width = 0.0002\n'
     (link,) = Simulator(loads(text)).__dict__["_chain"].links
-    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0]])
+    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0002, 0.0]])
 
 
 def lash(**values: Any) -> Table:
@@ -372,7 +373,7 @@ WRONG: list[tuple[Any, ...]] = [
         "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive",
         {"name": "drum_gain", "gain": [0.1, 0.2]},
     ),
-    ("has 2 values; give one", creep(share=[0.1, 0.2])),
+    ("has 3 values; give one", creep(share=[0.1, 0.2, 0.3])),
     ("has effect 'payload' twice", {"name": "payload"}, {"name": "payload"}),
     ("has effect 'backlash' twice", lash(), {"name": "gear_play"}),
     ("has no name", {"half_width": 1e-4}),

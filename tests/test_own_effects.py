@@ -226,6 +226,10 @@ def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
     scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(route(two_segments()))
     assert (scaled.bounds, scaled.of) == ((0.0, pytest.approx(0.26)), "")
     assert scaled.typical == pytest.approx(0.065)
+    wiring = route(two_segments())
+    curvature = Parameter("curvature", "1/m^2", bounds=(-3.0, 3.0), typical=0.1, of="1/offset^2").on(wiring)
+    assert curvature.typical == pytest.approx(0.1 / wiring.tendon_offset.mean() ** 2)
+    assert curvature.bounds == pytest.approx((-30.0 * curvature.scale, 30.0 * curvature.scale))
 
 
 @pytest.mark.usefixtures("clean_registry")

@@ -20,7 +20,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from sys import float_info
-from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 Per = Literal["robot", "segment", "drive"]
+Of = Literal["", "offset", "length", "1/offset", "1/offset^2"]
 
 
 class Seam(Enum):
@@ -82,12 +83,15 @@ class Parameter:
     per: Per = "robot"
     """One value for the robot, for each segment, or for each drive (a tendon, or an antagonistic pair of
     tendons)."""
-    of: Literal["", "offset", "length"] = ""
-    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone, or
-    the robot's length."""
+    of: Of = ""
+    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone,
+    one over it or over its square, or the robot's length."""
     shape: bool = False
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
     own."""
+    shared: bool = False
+    """Of one per drive. True: drives are alike unless one is worn, so a fit has one number for all, or one
+    drive alone."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -97,10 +101,11 @@ class Parameter:
                 f"its bounds {low} to {high}."
             )
         given: str = self.of  # a law of somebody's package may say anything
-        if given not in ("", "offset", "length"):
+        if given not in get_args(Of):
             old = " ('reach' is called 'offset' now)" if given == "reach" else ""
             raise EffectError(
-                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length' or ''{old}."
+                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length', '1/offset', "
+                f"'1/offset^2' or ''{old}."
             )
         if self.typical is None:
             span = 0.1 * (high - low)
@@ -119,7 +124,7 @@ class Parameter:
             float(routing.length.sum())
             if self.of == "length" or not routing.n_tendons
             else float(routing.tendon_offset.mean())
-        )
+        ) ** {"1/offset": -1, "1/offset^2": -2}.get(self.of, 1)
         assert self.typical is not None
         return Parameter(
             self.name,
@@ -131,6 +136,7 @@ class Parameter:
             self.per,
             "",
             self.shape,
+            self.shared,
         )
 
     @property
@@ -178,6 +184,19 @@ class Law:
     """A robot with fewer segments cannot show it."""
     frequent: ClassVar[bool] = False
     """Met on many robots: where nothing was found, its bound comes first."""
+    last_resort: ClassVar[bool] = False
+    """A form without a cause, wide enough to stand in for others: tried where no other effect is found."""
+    feels_tip: ClassVar[bool] = False
+    """Its tip force depends on where the tip is, `ports.tip_position`. A step of a simulator goes by the last
+    state and the compliance of the rod there; `settle` and a log solve force and rod together."""
+    by_pattern: ClassVar[bool] = False
+    """A search tries it where the alternative pattern of its name fits: a scan finds where its fit begins."""
+    reads_tension: ClassVar[bool] = False
+    """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
+    solve it together with the rod."""
+    refines: ClassVar[str] = ""
+    """Another effect of the same cause: tried wherever that one is, and named only where the log tells the
+    two laws apart."""
 
 
 def trait(what: Effect, name: str) -> Any:
@@ -221,8 +240,14 @@ class Operator(Law, ABC):
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
-        dl = ports.tendon_length - ports.rest_length
-        ports.shift_tendons(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl)
+        dl = ports.dl
+        swept = self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl
+        ports.shift_tendons(self.change(values, swept, ports))
+
+    def change(self, values: Floats, swept: Floats, ports: EffectPorts) -> Floats:
+        """(n, n_tendons) by how much lengths change [m], from what `sweep` has changed: the same, unless it
+        takes what the ports have besides lengths."""
+        return swept
 
 
 _REGISTRY: dict[str, Effect] = {}
@@ -332,7 +357,8 @@ def read_values(name: str, given: Mapping[str, object], routing: Routing, where:
     """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
     neutral.
 
-    A number stands for all segments or drives, a list for each. Raises `EffectError` for what cannot be.
+    A number stands for all segments or drives, a list for each; a `shared` parameter of drives takes a list
+    for each segment too, where drives and segments are not as many. Raises `EffectError` for what cannot be.
     """
     what = get_effect(name)
     known = [p.name for p in what.parameters]
@@ -346,6 +372,9 @@ def read_values(name: str, given: Mapping[str, object], routing: Routing, where:
         value = given.get(parameter.name, parameter.neutral)
         count = routing.count(parameter.per)
         listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
+        if parameter.shared and len(listed) == routing.n_segments != count:
+            ends = dict(zip(routing.drive.tolist(), routing.tendon_segment.tolist(), strict=True))
+            listed = [listed[ends[drive]] for drive in range(count)]
         if len(listed) != count:
             raise EffectError(
                 f"{where}: {parameter.name} of effect {name!r} has {len(listed)} values; give one, or "

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.effects.base import Effect, Seam, get_effect
+from fastrod.effects.base import Effect, Operator, Seam, get_effect, trait
 from fastrod.effects.ports import EffectPorts
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
@@ -47,7 +47,10 @@ class Link(NamedTuple):
 
 
 def at_rest(what: Effect, n: int, n_tendons: int) -> Floats:
-    """(n, m) memory of an effect at the start; m is 0 without one."""
+    """(n, m) memory of an effect at the start; m is 0 without one. Of an effect that feels the tip a
+    simulator keeps the force that it had, where the tip was, and how it gave (n, 3 + 3 + 9)."""
+    if feels_tip(what):
+        return np.zeros((n, 15))
     memory = what.memory(n, n_tendons)
     return np.empty((n, 0)) if memory.size == 0 else memory
 
@@ -58,12 +61,49 @@ def link(name: str, values: Floats, n_tendons: int) -> Link:
     return Link(name, what, values, at_rest(what, len(values), n_tendons))
 
 
+def feels_tip(what: Effect) -> bool:
+    """Whether an effect's tip force depends on where the tip is."""
+    return bool(trait(what, "feels_tip"))
+
+
+def reads_tension(what: Effect) -> bool:
+    """Whether an effect depends on the tension that tendons have."""
+    return bool(trait(what, "reads_tension"))
+
+
+def tip_feedback(links: Sequence[Link], opened: EffectPorts, tip: Floats) -> tuple[Floats, Floats]:
+    """What effects that feel the tip do where it is at `tip` (n, 3), base frame [m]: their tip force (n, 3)
+    [N] and its slopes by the tip (n, 3, 3) [N/m], force in the world frame. `opened` stays as it is."""
+
+    def force(at: Floats) -> Floats:
+        opened.tip_position, opened.tip_force = at, np.zeros_like(given)
+        for each in links:
+            each.effect.apply(each.values, each.memory, opened, opened.state, 0.0)
+        return opened.tip_force
+
+    given, seen = opened.tip_force, opened.tip_position
+    step = 1e-5 * float(opened.routing.length.sum())
+    every = [force(tip + sign * step * axis) for axis in np.eye(3) for sign in (1.0, -1.0)]
+    slopes = np.stack([(a - b) / (2.0 * step) for a, b in zip(every[::2], every[1::2], strict=True)], axis=-1)
+    found = force(tip)
+    opened.tip_force, opened.tip_position = given, seen
+    return found, slopes
+
+
+def approached(force: Floats, target: Floats, slopes: Floats, by_force: Floats) -> Floats:
+    """Tip force (n, 3) [N] nearer to balance, by one Newton step: a `force` has put the tip where effects
+    want `target`, with `slopes` (n, 3, 3) by the tip [N/m], and the tip gives by `by_force` (n, 3, 3)
+    [m/N]."""
+    matrix = np.eye(3) - slopes @ by_force
+    return np.asarray(force + np.linalg.solve(matrix, (target - force)[..., None])[..., 0])
+
+
 def act(links: Iterable[Link], opened: EffectPorts, state: Any = None, dt: float = 0.0) -> None:
-    """Let the effects before the camera change `opened`; memories move on by `dt` [s]. `state`: the last one
-    of a simulator."""
+    """Let the effects before the camera change `opened`, but for those that feel the tip (`tip_feedback`);
+    memories move on by `dt` [s]. `state`: the last one of a simulator."""
     opened.state = state
     for each in links:
-        if each.effect.seam is not Seam.SENSING:
+        if each.effect.seam is not Seam.SENSING and not feels_tip(each.effect):
             each.effect.apply(each.values, each.memory, opened, state, dt)
 
 
@@ -81,7 +121,12 @@ def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> 
             row.tendon_length = dl[i : i + 1] + rest
             one.effect.apply(one.values, memory, row, None, float(dt[i]))
             out[i] = row.dl[0]
-    opened.shift_tendons(out - dl)
+    change = out - dl
+    if isinstance(one.effect, Operator):
+        change = one.effect.change(
+            np.broadcast_to(one.values, (len(dl), one.values.shape[1])), change, opened
+        )
+    opened.shift_tendons(change)
 
 
 def sense(links: Iterable[Link], opened: EffectPorts, seen: SensedPoses, dt: float = 0.0) -> SensedPoses:

@@ -83,9 +83,37 @@ class EffectPipeline:
             self.links.append(executor.link(name, values, self.routing.n_tendons))
         self.time = np.full(n_robots, np.nan)
         """(n_robots,) since the first step [s]; nan before it."""
+        self.pulls_tip = False
+        """A force that depends on where the tip is has acted."""
+        self._tip_links = [link for link in self.links if executor.feels_tip(link.effect)]
+        self._reads_tension = any(executor.reads_tension(link.effect) for link in self.links)
+        self._tension = np.zeros((n_robots, self.routing.n_tendons))
+        self._lengths: Floats | None = None
+        self._before: list[Floats] = []
+        self._cold = np.zeros(n_robots, bool)
+        self.tip_step = np.zeros(n_robots)
+        """(n_robots,) by how much the rod is not yet where effects that follow it have put it [m]."""
+        # of the whole rod, tendons free: its tip gives by no more
+        self._softest = np.array(
+            [
+                sum(s.length for s in robot.segments) ** 3
+                / min(min(s.bending_stiffness) for s in robot.segments)
+                for robot in robots
+            ]
+        )[:, None, None] * (np.eye(3) / 3.0)
 
     def __bool__(self) -> bool:
         return bool(self.links)
+
+    @property
+    def feels_tip(self) -> bool:
+        """Whether an effect's force depends on where the tip is."""
+        return bool(self._tip_links)
+
+    @property
+    def follows(self) -> bool:
+        """Whether an effect depends on what the rod does: on where its tip is, or its tendons' tension."""
+        return self.feels_tip or self._reads_tension
 
     def reset(self, rows: Any) -> None:
         """Let these robots begin at rest again."""
@@ -102,21 +130,90 @@ class EffectPipeline:
         n_steps: int,
         skip: Flags,
         gravity: Floats | None = None,
+        compliance: Floats | None = None,
+        again: bool = False,
     ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
         """What the kernel reads at this step, and the point forces of effects (`close_ports`). Memories move
         on, but for the robots `skip`, whose inputs cannot be used.
 
         `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
+        Effects that feel the tip read it from `state`, and `compliance` (n_robots, 3, 3) [m/N], world, says
+        how it will give to them; `again` repeats the step for these, from where its memories began.
         """
         self._felt = self.gravity if gravity is None else gravity
-        first = np.isnan(self.time)
-        self.time = np.where(skip, self.time, np.where(first, 0.0, self.time + dt))
-        before = [link.memory.copy() for link in self.links] if skip.any() else []
+        if again:
+            for link, old in zip(self.links, self._before, strict=True):
+                if not executor.feels_tip(link.effect):
+                    link.memory[:] = old
+        else:
+            self._cold = np.isnan(self.time)
+            self.time = np.where(skip, self.time, np.where(self._cold, 0.0, self.time + dt))
+        before = [link.memory.copy() for link in self.links] if skip.any() or self.follows else []
+        self._before = before
         opened = self._open(ports, params, n_steps)
+        if self._reads_tension:
+            cold = self._cold & (not again)
+            if state is not None and len(state.tension) != len(opened):
+                raise EffectError(
+                    "an effect goes by the tension of the tendons, which outputs='tip' leaves out; give "
+                    "Simulator(robot, outputs='full')."
+                )
+            if state is not None:
+                self._tension = np.where(np.isfinite(state.tension), state.tension, self._tension)
+            self._tension = np.where(cold[:, None], 0.0, self._tension)
+            opened.solved_tension = self._tension
         executor.act(self.links, opened, state, dt)
+        self.tip_step = np.zeros(len(opened))
+        if self._reads_tension:
+            if again and self._lengths is not None:
+                self.tip_step = np.abs(opened.tendon_length - self._lengths).max(1, initial=0.0)
+            self._lengths = opened.tendon_length.copy()
+        if self._tip_links:
+            self._feel(opened, state, compliance, self._cold if not again else np.zeros_like(skip))
         for link, old in zip(self.links, before, strict=bool(before)):
-            link.memory[skip] = old[skip]
+            # where the tip was is known to robots that miss a step, too
+            only = slice(3) if executor.feels_tip(link.effect) else slice(None)
+            link.memory[skip, only] = old[skip, only]
         return close_ports(opened, ports, params)
+
+    def _feel(self, opened: EffectPorts, state: Any, compliance: Floats | None, cold: Flags) -> None:
+        """Add the force of effects that feel the tip, a Newton step nearer to balance; the first of them
+        keeps it. Of robots that are `cold` the tip is where the straight one has it."""
+        base = matrix_from_quaternion(opened.base_pose[:, 3:])
+        into = np.swapaxes(base, 1, 2)
+        softest = np.broadcast_to(self._softest, (len(opened), 3, 3))
+        by_force = softest if compliance is None else into @ compliance
+        straight = np.zeros((len(opened), 3))
+        straight[:, 2] = self.routing.length.sum()
+        tip = straight if state is None else self._tip(opened, state)
+        memory = self._tip_links[0].memory
+        known = ~cold & np.isfinite(tip).all(1) & np.isfinite(by_force).all((1, 2))
+        last = np.concatenate([tip, by_force.reshape(-1, 9)], axis=1)
+        last = np.where(known[:, None], last, memory[:, 3:])
+        begin = np.concatenate([straight, (into @ softest).reshape(-1, 9)], axis=1)
+        last = np.where((cold | ~last[:, :3].any(1))[:, None], begin, last)
+        memory[:, 3:] = last
+        tip, by_force = last[:, :3], last[:, 3:].reshape(-1, 3, 3)
+        target, slopes = executor.tip_feedback(self._tip_links, opened, tip)
+        self.pulls_tip = self.pulls_tip or bool(target.any() or slopes.any())
+        before = memory[:, :3].copy()
+        force = executor.approached(before, target, slopes, by_force)
+        self.tip_step += np.linalg.norm(by_force @ (force - before)[..., None], axis=(1, 2))
+        memory[:, :3] = force
+        opened.tip_force += force
+
+    @staticmethod
+    def _tip(opened: EffectPorts, state: Any) -> Floats:
+        return executor.from_base(
+            opened.base_pose, state.tip_position, state.tip_rotation, np.zeros((len(opened), 0, 3))
+        ).tip_position
+
+    def tip_feedback(self, ports: Ports, params: Params, state: Any, n_steps: int) -> tuple[Floats, Floats]:
+        """Tip force (n_robots, 3) [N] of effects that feel the tip where it is in `state`, and its slopes by
+        the tip (n_robots, 3, 3) [N/m], world. `ports` are those before the effects."""
+        opened = self._open(ports, params, n_steps)
+        force, slopes = executor.tip_feedback(self._tip_links, opened, self._tip(opened, state))
+        return force, slopes @ np.swapaxes(matrix_from_quaternion(opened.base_pose[:, 3:]), 1, 2)
 
     def slopes(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int) -> Floats:
         """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m], or tensions

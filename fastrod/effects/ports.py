@@ -81,10 +81,13 @@ class EffectPorts:
     """Read: rows are samples of a log; no state is carried from one to the next."""
     state: Any = None
     """Read: the last `State`, as `apply` has it."""
+    solved_tension: Floats = field(default_factory=lambda: np.zeros((1, 1)))
+    """Read: (n, n_tendons) or (1, 1) of the last solution, for effects that read it; 0 before the first
+    [N]."""
     point_forces: list[tuple[Floats, Floats]] = field(default_factory=list)
     """Arclength (n,) [m] and force (n, 3) [N] of each that effects have added through `add_point_force`."""
     tip_position: Floats = field(default_factory=_none)
-    """SENSING only: (n, 3) base frame [m]."""
+    """SENSING, and effects that feel the tip, only: (n, 3) base frame [m]."""
     tip_rotation: Floats = field(default_factory=_none)
     """SENSING only: (n, 3, 3) base_from_tip."""
     points: Floats = field(default_factory=_none)
@@ -95,7 +98,7 @@ class EffectPorts:
 
     def rows(self, which: slice) -> EffectPorts:
         """A copy of some rows."""
-        alike = ("routing", "rest_length", "n_steps", "stateless", "state")
+        alike = ("routing", "rest_length", "n_steps", "stateless", "state", "solved_tension")
         return EffectPorts(
             **{
                 f.name: getattr(self, f.name) if f.name in alike else getattr(self, f.name)[which].copy()

@@ -49,7 +49,7 @@ def with_effects(
     robot: Robot, effects: Sequence[str], rng: np.random.Generator
 ) -> tuple[Robot, dict[str, float]]:
     """The robot with these effects, and their values by `effect.parameter` (with _1, _2 ... where there is
-    one per segment or drive).
+    one per segment or drive; of a `shared` parameter there is one for all).
 
     Every number is drawn evenly from half to one and a half of its typical size, with either sign where both
     can be, within its bounds.
@@ -60,7 +60,8 @@ def with_effects(
     for effect in effects:
         table: dict[str, Any] = {}
         for parameter in (p.on(wiring) for p in get_effect(effect).parameters):
-            count = wiring.count(parameter.per)
+            # drives that are alike by default are drawn alike
+            count = 1 if parameter.shared else wiring.count(parameter.per)
             size = parameter.scale * rng.uniform(*_SPREAD, count)
             if parameter.bounds[0] < 0.0 and not parameter.shape:
                 size *= rng.choice((-1.0, 1.0), count)

@@ -117,6 +117,12 @@ class Motions(Statics):
         self._note_call(modal)
         return self._finish_modes(modal, ports, found, ok, rows, only)
 
+    def _step_compliance(self) -> Floats | None:
+        """In motion the tip is where it was a step ago: nothing gives to a force within the step."""
+        if self.dynamics and self._warm.any():
+            return np.zeros((self.n_robots, 3, 3))
+        return super()._step_compliance()
+
     def _use_numbers(self, robot: Robot | None) -> None:
         if self._modal is not None and robot is not None:
             self._modal.replace((robot,))

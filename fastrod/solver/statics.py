@@ -7,6 +7,7 @@ of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -49,6 +50,7 @@ _ALONG = (
     "base_wrench",
 )
 DIVERGED = "the observer diverged, and no shape was found on these inputs"
+_BALANCE = 20  # rounds of `settle` in which a rod and a force that goes by its tip come to rest
 _UNSTABLE = "the shape that balances its loads is an unstable one"
 
 
@@ -308,8 +310,12 @@ class Statics:
         self.reset(mask)
         self._shaped[which] = False
 
-    def _read(self, given: Inputs, only: Flags | None = None) -> tuple[Ports, Ints]:
-        """The ports, and the robots whose inputs are good; of those in `only`, where it is given."""
+    def _read(self, given: Inputs, only: Flags | None = None, again: bool = False) -> tuple[Ports, Ints]:
+        """The ports, and the robots whose inputs are good; of those in `only`, where it is given. `again`:
+        the same inputs once more, the tip now elsewhere."""
+        compliance = None
+        if self._chain.feels_tip:
+            compliance = self._tip_compliance() if again else self._step_compliance()
         self._derived = None
         ports = self._reader.ports(given)
         self._given = given
@@ -321,7 +327,15 @@ class Statics:
             bare, params = self._bare, self._passes.params
             self._bare = ports
             ports, self._passes.params, points = self._chain.act(
-                ports, self._plain, self._state, self.dt, self._layout.n_steps, out, self._reader.gravity
+                ports,
+                self._plain,
+                self._state,
+                self.dt,
+                self._layout.n_steps,
+                out,
+                self._reader.gravity,
+                compliance,
+                again,
             )
             if points:
                 ports, self._given = self._reader.with_point_forces(ports, given, points)
@@ -345,11 +359,39 @@ class Statics:
                 name: np.where(out[:, None], value, getattr(ports, name)) for name, value in kept.items()
             }
             ports = ports._replace(**{name: np.ascontiguousarray(a) for name, a in merged.items()})
-        track_force = self._passes.tracks_force or self._force_moves(ports.tip_force)
+        track_force = self._passes.tracks_force or self._chain.pulls_tip or self._force_moves(ports.tip_force)
         self._passes.remember(
             len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force
         )
         return ports, rows
+
+    def _step_compliance(self) -> Floats | None:
+        """How the tip gives to a force within a step."""
+        return self._tip_compliance()
+
+    def _tip_compliance(self) -> Floats | None:
+        """(n_robots, 3, 3) how the tip gives to a force, world [m/N]; None before the first state."""
+        if self._state is None or self._ports is None or not self._warm.any():
+            return None
+        kept = copied(self._passes.peek())  # a step goes on as if nobody had looked
+        by_force = np.asarray(self._linear(self._ports).by_force())[:, :3]
+        self._passes.memory = kept
+        return by_force
+
+    def _balanced(self, given: Inputs, state: State, tolerance: float, only: Flags | None) -> State:
+        """The same settled again until effects that follow the rod are those of where it is."""
+        for _ in range(_BALANCE):
+            ports, rows = self._read(given, only, again=True)
+            off = np.zeros(self.n_robots)
+            off[rows] = np.where(state.ok[rows], self._chain.tip_step[rows], 0.0)
+            if not (off > tolerance).any():
+                return state
+            state = self._settle(ports, rows, tolerance, only)
+        lost = ~(off <= tolerance)
+        never = "settle found no balance of the rod with an effect that depends on its tip or its tension"
+        problems = {int(i): ProblemSentence(f"{never}.", Problem.NOT_CONVERGED) for i in np.flatnonzero(lost)}
+        self._state = replace(state, ok=state.ok & ~lost, problems=dict(state.problems) | problems)
+        return self._state
 
     def _keeps_jacobian(self, learns: bool) -> Flags:
         """(n_robots,) these correct the boundary by the gain that they have."""

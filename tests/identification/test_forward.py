@@ -27,13 +27,16 @@ from fastrod.types import Floats
 N = 30
 GIVEN: dict[str, dict[str, Any]] = {
     "latency": {"delay": 0.13},
+    "slip": {"step": [4e-4, 0.0, -3e-4, 0.0], "at": 0.7},
     "temperature": {"gain": 0.1, "time_constant": 20.0},
     "backlash": {"half_width": [3e-4, 5e-4], "rounding": 0.2},
     "friction": {"half_width": [4e-4, 3e-4], "presliding": 6e-4, "growth": 0.5, "spread": 0.7},
     "creep": {"share": 0.15, "time_constant": 0.4},
+    "capstan_friction": {"mu": [0.4, 0.3, 0.5, 0.4], "presliding": 6e-4, "spread": 0.7},
     "plastic_set": {"share": 0.2, "yield_at": 0.3},
     "second_order_lag": {"period": 0.08, "damping": 0.2},
     "time_drift": {"x": 1e-4, "y": -2e-4, "z": 5e-5},
+    "settling_drift": {"x": 1e-3, "y": -2e-3, "z": 5e-4, "time_constant": 5.0},
 }
 TABLES: dict[str, dict[str, Any]] = {
     name: GIVEN.get(name)

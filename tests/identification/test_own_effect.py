@@ -119,7 +119,10 @@ def test_every_law_of_the_library_has_what_it_had() -> None:
         "latency": Signal.MOTION,
         "temperature": Signal.TIME,
         "time_drift": Signal.TIME,
+        "settling_drift": Signal.TIME,
+        "slip": Signal.TIME,
         "tip_force": Signal.FORCE,
+        "tip_spring": Signal.TIP,
     }
     assert signal_of(get_effect("gravity")) is signal_of(get_effect("payload")) is Signal.GRAVITY
     assert signal_of(get_effect("friction")) is Signal.LOOP
@@ -130,7 +133,7 @@ def test_every_law_of_the_library_has_what_it_had() -> None:
     assert {name for name in effect_names() if trait(get_effect(name), "frequent")} == frequent
     pairs = [(name, other) for name in effect_names() for other in trait(get_effect(name), "separated_by")]
     assert all(other in effect_names() for _, other in pairs)
-    assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 26
+    assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 33
 
 
 def test_a_class_of_no_base_has_the_same_defaults() -> None:

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, read_values
 from fastrod.effects.executor import SensedPoses
+from fastrod.effects.pipeline import EffectPipeline
 from fastrod.kernels.operators import (
     BUFFER,
     SLIDERS,
@@ -28,7 +29,9 @@ from fastrod.kernels.operators import (
     second_order,
     yielding,
 )
+from fastrod.model.compile import compile_robots
 from fastrod.model.routing import route
+from fastrod.solver.inputs import Inputs, Reader
 from fastrod.solver.state import State
 
 ROUNDING = 1e-13  # of numbers of size one, after some hundred operations
@@ -163,7 +166,7 @@ def test_friction_grows_with_the_angle_that_a_tendon_wraps() -> None:
     # a bend of one radian in the end
     dl = np.linspace(0.0, 1.0, 50)[:, None] * (bend(robot, 0.8, 0.6) - robot.rest_tendon_length)
     table = {"half_width": 2e-4, "presliding": 1e-4, "growth": 0.7, "spread": 0.0}
-    values = np.array([[*table.values()]])
+    values = read_values("friction", table, route(robot), "test")[None]
     what: Any = get_effect("friction")
     lost = dl - what.sweep(values, what.memory(1, 4), dl[None], np.full(50, 0.1), route(robot))[0]
     assert_allclose(np.abs(lost[-1]), 2e-4 * 1.7, rtol=1e-12)
@@ -383,7 +386,7 @@ def with_tendons(robot: Robot, **fields: Callable[[Tendon, int], Any]) -> Robot:
     )
 
 
-ROD, LONGER = rod(), rod(extension=(-0.02, 0.02))
+ROD, LONGER, THREE = rod(), rod(extension=(-0.02, 0.02)), rod(n_tendons=3)
 BENT, REST = bend(ROD, 0.5, 0.3), ROD.rest_tendon_length
 ROUND = bend(ROD, 0.6, 0.8)  # a bend of one radian
 CHAIN = with_segments(
@@ -507,6 +510,71 @@ def test_an_effect_is_a_robot_that_is_built_or_driven_so(case: str) -> None:
     assert apart(settled(*one), settled(*other)) <= 1.0
 
 
+def interacting(pulls: Any, **weights: Any) -> np.ndarray:
+    """(n, 2) bend [rad] that pulls (n, 3) [m] of three tendons ask for beside `tendon_interaction`."""
+    pulls = np.atleast_2d(pulls)
+    robot = having(THREE, "tendon_interaction", **weights)
+    layout, params, guess = compile_robots((THREE,), 4)
+    rest = THREE.rest_tendon_length
+    given = Reader(layout, params, guess, len(pulls)).ports(Inputs(tendon_length=rest - pulls))
+    still = np.zeros(len(pulls), dtype=bool)
+    felt, _, _ = EffectPipeline([robot], len(pulls)).act(given, params, None, 0.1, 4, still)
+    return np.asarray(route(robot).bend(felt.tendon_length - rest)[:, 0])
+
+
+def test_pulls_that_interact_have_the_slope_of_the_equation() -> None:
+    """Every weight has its place: against scipy's quadrature of the printed law."""
+    a, b, w = (60.0, -80.0, 20.0), (-4e3, 6e3, 1e3), (30.0, -20.0, 50.0)
+    c, d = (2e3, -1e3, 3e3), (-2e3, 1.5e3, 1e3)
+    p = np.array([0.004, 0.007, 0.002])
+
+    def pulled_to(i: int) -> float:
+        n, m = p[(i + 1) % 3], p[i - 1]
+        others = w[i] * n + w[i - 1] * m + c[i] * n * n + d[i] * m * m
+        law = lambda s: np.exp(2.0 * np.tanh(0.5 * (a[i] * s + b[i] * s * s + others)))  # noqa: E731
+        return float(quad(law, 0.0, p[i], epsabs=1e-14)[0])
+
+    expected = interacting([pulled_to(i) for i in range(3)])
+    found = interacting(p, slope=[*a], curvature=[*b], pair=[*w], next=[*c], previous=[*d])
+    # five nodes of Gauss: the exponent varies by 0.6 over a pull
+    assert_allclose(found, expected, rtol=1e-6)
+    assert np.abs(found - interacting(p)).max() > 0.05
+
+
+def test_equal_tendons_interact_alike_from_every_side() -> None:
+    """A robot that looks the same after a third of a turn bends the same after it."""
+    weights = {"slope": 60.0, "curvature": -4e3, "pair": 30.0, "next": 2e3, "previous": -1e3}
+    pulls = np.array([0.005, 0.002, 0.0])
+    one, other = (interacting(np.roll(pulls, k), **weights)[0] for k in (0, 1))
+    third = 2.0 * np.pi / 3.0
+    turn = np.array([[np.cos(third), -np.sin(third)], [np.sin(third), np.cos(third)]])
+    assert_allclose(other, turn @ one, atol=1e-14)
+
+
+def test_no_pull_bends_back_at_any_weights() -> None:
+    """Along a tendon's own pull the bend toward it grows, for weights to their bounds."""
+    parameters = [p.on(route(THREE)) for p in get_effect("tendon_interaction").parameters]
+    rng, toward = np.random.default_rng(5), route(THREE).arms[0] / np.linalg.norm(route(THREE).arms[0])
+    for _ in range(20):
+        weights = {
+            p.name: rng.uniform(*p.bounds, 3).tolist() for p in parameters if p.name in ("slope", "curvature")
+        }
+        pulls = np.zeros((200, 3))
+        pulls[:, 0] = np.linspace(0.0, 0.01, 200)
+        along = interacting(pulls, **weights) @ toward
+        assert (np.diff(along) < 0.0).all()  # arms are d(length): a pull shortens
+
+
+def test_two_pairs_of_tendons_interact_once() -> None:
+    """Antagonists are one drive, and of two drives each is the other's only neighbour."""
+    idle = having(ROD, "tendon_interaction", pair=[0.0, 50.0], previous=[5e3, 5e3])
+    assert apart(settled(idle, BENT), settled(ROD, BENT)) == 0.0
+    felt, pulls = BENT - REST, (REST - BENT)[:2]
+    factor = np.exp(2.0 * np.tanh(0.5 * 50.0 * pulls[::-1]))
+    one = settled(having(ROD, "tendon_interaction", pair=[50.0, 0.0]), BENT)
+    assert apart(one, settled(ROD, REST + felt * np.tile(factor, 2))) <= 1.0
+
+
 def test_the_effect_tip_force_turns_with_the_base() -> None:
     robot = having(CHAIN, "tip_force", x=0.1, y=-0.05, z=0.2)
     turned, still = (seen(robot, PULLED, **given) for given in ({"base_pose": LOADS["base_pose"]}, {}))
@@ -591,6 +659,12 @@ def test_what_the_camera_makes_of_the_tip() -> None:
         assert_allclose(found[:2], true[:2] * (1.0 + 0.2 * (true[:2] @ true[:2]) / 0.07**2), rtol=1e-14)
         assert found[2] == true[2]
 
+    settling = {"x": 2e-3, "y": 0.0, "z": -1e-3, "time_constant": 2.5}
+    drifting = Simulator(having(robot, "settling_drift", **settling), dt=0.5, points_per_segment=8)
+    for k in range(4):  # of the whole way, 1 - 1/e after one time constant
+        drifting.settle(lengths, tolerance=1e-12, **given)
+        way = 1.0 - np.exp(-0.5 * k / 2.5)
+        assert_allclose(drifting.measure().tip_position[0], r + way * np.array([2e-3, 0.0, -1e-3]), atol=1e-9)
     drifting = Simulator(having(robot, "time_drift", x=1e-5, y=0.0, z=-2e-5), dt=0.5, points_per_segment=8)
     for k in range(3):
         drifting.settle(lengths, tolerance=1e-12, **given)
@@ -619,7 +693,7 @@ def test_an_effect_on_the_tendons_is_its_operator_on_what_bends(name: str, value
     robot = rod()
     path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
     what: Any = get_effect(name)
-    row = np.array([[values.get(p.name, p.neutral) for p in what.parameters]])
+    row = read_values(name, values, route(robot), "test")[None]
     dl = path - robot.rest_tendon_length
     moved = what.sweep(row, what.memory(1, 4), dl[None], np.full(12, 0.05), route(robot))[0]
     sim, base = Simulator(having(robot, name, **values), dt=0.05), Simulator(robot, dt=0.05)

@@ -434,7 +434,8 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
         place = forward.prepare_log(forward.sample(log).on(frames), robot, model.wiring)
         effects = forward.effects_at(model, np.zeros(0))
         sim = Simulator(bare, n_robots=len(frames), points_per_segment=forward.N_STEPS)
-        state = sim.settle_ports(*place.kernel(place.drive(effects)), forward.TOLERANCE * robot.length)
+        _, opened, _ = place.solve(effects, forward.PredictedRod(place.samples, robot), robot)
+        state = sim.settle_ports(*place.kernel(opened), forward.TOLERANCE * robot.length)
         arclength = _finer(state.arclength, robot.n_segments)
         fine = sim.shape(arclength)
         position, rotation = fine.position, fine.rotation

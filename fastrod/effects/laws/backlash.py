@@ -33,8 +33,9 @@ class Backlash(Operator):
             bounds=(0.0, 0.6),
             typical=0.03,
             starts=(0.012, 0.04),
-            per="segment",
+            per="drive",
             of="offset",
+            shared=True,
         ),
         Parameter("rounding", "", bounds=(0.0, 0.4), typical=0.15, starts=(0.15,), shape=True),
     )
@@ -52,6 +53,9 @@ class Backlash(Operator):
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
         play(
-            out, memory, routing.by_end(values[:, :-1]), np.repeat(values[:, -1:], routing.n_tendons, axis=1)
+            out,
+            memory,
+            routing.by_tendon(values[:, :-1]),
+            np.repeat(values[:, -1:], routing.n_tendons, axis=1),
         )
         return out

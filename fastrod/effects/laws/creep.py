@@ -25,7 +25,7 @@ class Creep(Operator):
     seam = Seam.ACTUATION
     order = 55.0
     parameters = (
-        Parameter("share", "", bounds=(0.0, 1.0), typical=0.08, starts=(0.08,)),
+        Parameter("share", "", bounds=(0.0, 1.0), typical=0.08, starts=(0.08,), per="drive", shared=True),
         Parameter(
             "time_constant",
             "s",
@@ -51,6 +51,6 @@ class Creep(Operator):
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        fraction, tau = (np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (0, 1))
-        relaxation(out, memory, fraction, tau, dt)
+        tau = np.repeat(values[:, -1:], routing.n_tendons, axis=1)
+        relaxation(out, memory, routing.by_tendon(values[:, :-1]), tau, dt)
         return out

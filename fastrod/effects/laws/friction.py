@@ -34,8 +34,9 @@ class Friction(Operator):
             bounds=(0.0, 0.6),
             typical=0.04,
             starts=(0.02, 0.08),
-            per="segment",
+            per="drive",
             of="offset",
+            shared=True,
         ),
         Parameter(
             "presliding",
@@ -68,12 +69,12 @@ class Friction(Operator):
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        n = routing.n_segments
+        n = routing.n_drives
         wrapped = np.cumsum(np.linalg.norm(routing.bend(dl), axis=-1), axis=-1)
         presliding, growth, spread = (
             np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (n, n + 1, n + 2)
         )
         elastoplastic(
-            out, memory, routing.by_end(values[:, :n]), presliding, spread, growth, routing.by_end(wrapped)
+            out, memory, routing.by_tendon(values[:, :n]), presliding, spread, growth, routing.by_end(wrapped)
         )
         return out

@@ -29,8 +29,9 @@ class Slack(Static):
             bounds=(0.0, 0.6),
             typical=0.04,
             starts=(0.015, 0.05),
-            per="segment",
+            per="drive",
             of="offset",
+            shared=True,
         ),
     )
     excited_by = "slow crossings of neutral, large bends"
@@ -38,5 +39,5 @@ class Slack(Static):
     synonyms = ("dead_zone",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        dl, gap = ports.dl, ports.routing.by_end(values)
+        dl, gap = ports.dl, ports.routing.by_tendon(values)
         ports.shift_tendons(-np.clip(dl, -gap, gap))

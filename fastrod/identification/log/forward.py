@@ -14,7 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fastrod.effects.base import Seam, has_memory
-from fastrod.effects.executor import Link, SensedPoses, act, from_base, link, sense, sweep
+from fastrod.effects.executor import (
+    Link,
+    SensedPoses,
+    act,
+    approached,
+    feels_tip,
+    from_base,
+    link,
+    reads_tension,
+    sense,
+    sweep,
+    tip_feedback,
+)
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
@@ -22,7 +34,7 @@ from fastrod.identification.log.unknowns import Model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing
+from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.solver.modal import Modes
@@ -33,6 +45,8 @@ TOLERANCE = 1e-8  # of the robot's length: far below any camera
 # passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some
 # hundreds of them)
 _LOST = 500
+_BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
+_FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 MODES = Modes(4, 2)  # of rods that need modes, as far off
 
@@ -99,17 +113,21 @@ class PredictedRod:
         self.threads = threads
         self.samples, self.points = samples, points and samples.log.points is not None
         bare = replace(robot, effects=())
+        # tendons that do not stretch show no effect of their tension
+        self._tense = any(tendon.compliance > 0.0 for tendon in robot.tendons)
         n = len(samples.rows)
         self._sim = Simulator(
             bare,
             n_robots=n,
             points_per_segment=N_STEPS,
-            outputs="full" if self.points else "tip",
+            outputs="full" if self.points or self._tense else "tip",
             modes=MODES if solver_of([bare], None, False) == "modal" else None,
             threads=threads,
         )
         self._tolerance = TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
+        self.tension: Floats = np.zeros((n, robot.n_tendons))
+        """(n, n_tendons) of the last solution, 0 where no tendon stretches [N]."""
         self.runs = 0
         """Batches solved so far."""
         self.cost = 0.0
@@ -129,6 +147,7 @@ class PredictedRod:
             replace(robot, effects=()),
         )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
+        self.tension = np.nan_to_num(state.tension) if len(state.tension) else 0.0 * ports.tendon_length
         points = np.zeros((len(state.ok), 0, 3))
         if self.points:
             points = (
@@ -165,12 +184,25 @@ class PreparedLog:
     """(n, n_tendons) commanded, of every sample [m]."""
     base_rotation: Floats
     """(n_rows, 3, 3) or (1, 3, 3)."""
+    tension: Floats | None = None
+    """(n, n_tendons) that tendons have at every sample, as far as it is known [N]."""
 
     def open(self) -> EffectPorts:
         """Ports of the rows, ready for effects."""
         return self._open(
             self.ports, len(self.samples.rows), self.samples.time[self.samples.rows], self.base_rotation
         )
+
+    def under(self, solved: Floats, ok: Flags) -> PreparedLog:
+        """The same with the tension (n_rows, n_tendons) [N] of the rows that are `ok`, linear in time between
+        these."""
+        rows, tension = self.samples.rows[ok], np.zeros_like(self.dl)
+        for span in self.samples.runs:
+            inside = (rows >= span.start) & (rows < span.stop)
+            for k in range(tension.shape[1] if inside.any() else 0):
+                known = self.samples.time[rows[inside]], solved[ok][inside, k]
+                tension[span, k] = np.interp(self.samples.time[span], *known)
+        return replace(self, tension=tension)
 
     def _open(self, ports: Ports, n: int, time: Floats, base_rotation: Floats) -> EffectPorts:
         return open_ports(
@@ -187,13 +219,15 @@ class PreparedLog:
         )
 
     def drive(self, links: Sequence[Link]) -> EffectPorts:
-        """Ports of the rows after the effects of `links`, but for sensing. Up to the last one with a memory
-        they run over every sample, for the tendons' lengths."""
+        """Ports of the rows after the effects of `links`, less sensing and those that feel the tip. Up to the
+        last one with a memory they run over every sample, for the tendons' lengths."""
         opened, rest = self.open(), self.robot.rest_tendon_length
         swept = 1 + max((i for i, each in enumerate(links) if has_memory(each.effect)), default=-1)
         if swept:
             alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
             every = self._open(alone, len(self.dl), self.samples.time, self.base_rotation[:1])
+            if self.tension is not None:
+                every.solved_tension = self.tension
             for each in links[:swept]:
                 if has_memory(each.effect):
                     sweep(each, every, self.samples.runs, self.samples.dt)
@@ -203,6 +237,64 @@ class PreparedLog:
             opened.tendon_length = every.dl[self.samples.rows] + rest
         act([each.on(len(opened)) for each in links[swept:]], opened)
         return opened
+
+    def solve(
+        self, links: Sequence[Link], rod: PredictedRod, robot: Robot
+    ) -> tuple[PreparedLog, EffectPorts, PredictedPose]:
+        """`_solve` at the tension that it leads to, if effects read it; and this log at that."""
+        place, (opened, pose, tension) = self, self._solve(links, rod, robot)
+        off = np.full(len(pose.ok), np.inf)
+        for _ in range(_BALANCE if any(reads_tension(each.effect) for each in links) else 0):
+            before, place = pose, place.under(tension, pose.ok)
+            opened, pose, tension = place._solve(links, rod, robot)
+            off = np.linalg.norm(pose.position - before.position, axis=1)
+            if not (off[pose.ok] > 3.0 * TOLERANCE * robot.length).any():
+                break
+        if place is not self:
+            pose = pose._replace(ok=pose.ok & (off <= 1e3 * TOLERANCE * robot.length))
+        return place.under(tension, pose.ok), opened, pose
+
+    def _solve(
+        self, links: Sequence[Link], rod: PredictedRod, robot: Robot
+    ) -> tuple[EffectPorts, PredictedPose, Floats]:
+        """Ports of the rows after the effects of `links`, those that feel the tip included, and the pose of
+        `robot` at these, with its tension. A row at which such a force and the rod find no balance is not
+        `ok`."""
+        felt = [each.on(len(self.samples.rows)) for each in links if feels_tip(each.effect)]
+        opened = self.drive(links)
+        pose = rod.solve(*self.kernel(opened), robot)
+        tension = rod.tension
+        if not felt:
+            return opened, pose, tension
+        given, force = opened.tip_force, np.zeros_like(opened.tip_force)
+        kept = rod.keep()
+        step = _FORCE * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2
+        columns = []
+        for axis in np.eye(3):
+            opened.tip_force = given + step * axis
+            moved = rod.solve(*self.kernel(opened), robot, pose.ok)
+            columns.append(np.where(pose.ok[:, None], (moved.position - pose.position) / step, 0.0))
+            rod.back(kept)
+        opened.tip_force, by_force = given, np.stack(columns, axis=-1)
+        for _ in range(_BALANCE):
+            target, slopes = tip_feedback(felt, opened, pose.position)
+            now = approached(force, target, slopes, by_force)
+            change = np.where(pose.ok[:, None], now - force, 0.0)
+            expected = np.einsum("nij,nj->ni", by_force, change)
+            off = np.linalg.norm(expected, axis=1)
+            if not (off > TOLERANCE * robot.length).any():
+                break
+            force = force + change
+            opened.tip_force = given + force
+            before, pose = pose, rod.solve(*self.kernel(opened), robot)
+            tension = rod.tension
+            # what the rod did beyond its compliance corrects it along the change (Broyden 1965)
+            beyond = np.where(pose.ok[:, None], pose.position - before.position - expected, 0.0)
+            size = np.maximum((change**2).sum(1), 1e-30)
+            by_force = by_force + beyond[:, :, None] * (change / size[:, None])[:, None]
+        else:
+            pose = pose._replace(ok=pose.ok & (off <= 1e3 * TOLERANCE * robot.length))
+        return opened, pose, tension
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
@@ -218,14 +310,16 @@ class PreparedLog:
 
 
 def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
-    """The inputs of the rows of `samples` for `robot`."""
+    """The inputs of the rows of `samples` for `robot`, its tendons grouped into drives as in `wiring`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     reader = Reader(layout, params, rest, len(log))
     ports = reader.ports(Inputs(**dict[str, Any](inputs(log, robot))))
     return PreparedLog(
         robot,
-        wiring,
+        # the arms of this robot: where offsets are fitted, a bend in an effect is by these, as it will be in
+        # the robot file
+        replace(route(robot), drive=wiring.drive, drive_sign=wiring.drive_sign),
         samples,
         ports,
         params,
@@ -256,4 +350,4 @@ def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod)
     robot = model.robot_at(theta)
     place = prepare_log(samples, robot, model.wiring)
     links = effects_at(model, theta)
-    return place.see(rod.solve(*place.kernel(place.drive(links)), robot), links)
+    return place.see(place.solve(links, rod, robot)[2], links)

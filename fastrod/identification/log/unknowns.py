@@ -110,10 +110,11 @@ class Model:
         start: Mapping[str, float] | None = None,
         drop: Sequence[str] = (),
         split: bool = False,
+        drive: int | None = None,
     ) -> Model:
         """This model with one more effect, all its parameters unknown but those named in `drop`, which stay
-        neutral."""
-        added = effect_unknowns(name, self.wiring, start or {}, drop, split)
+        neutral. With `drive` (from 0 on) only that drive has it."""
+        added = effect_unknowns(name, self.wiring, start or {}, drop, split, drive)
         names = tuple(known for known in effect_names() if known in (*self.effects, name))
         return replace(self, effects=names, unknowns=self.unknowns + added)
 
@@ -121,6 +122,17 @@ class Model:
         """This model without an effect."""
         kept = tuple(u for u in self.unknowns if u.place[:2] != ("effect", name))
         return replace(self, effects=tuple(e for e in self.effects if e != name), unknowns=kept)
+
+    def drive_of(self, name: str) -> int | None:
+        """The one drive that has an effect, from 0 on; None where all have it."""
+        shared = {p.name for p in get_effect(name).parameters if p.shared}
+        every = columns(get_effect(name), self.wiring)
+        for unknown in self.unknowns if shared and self.wiring.n_drives > 1 else ():
+            if unknown.place[:2] == ("effect", name) and len(unknown.place) == 3:
+                label, _, number = every[int(unknown.place[2])].rpartition("_")
+                if label in shared:
+                    return int(number) - 1
+        return None
 
     def values(self, theta: Floats) -> dict[str, Floats]:
         """Effect name -> (n_columns,) values at the fitted numbers `theta` (p,); what is not unknown, as the
@@ -167,8 +179,11 @@ def effect_unknowns(
     start: Mapping[str, float] | None = None,
     drop: Sequence[str] = (),
     split: bool = False,
+    drive: int | None = None,
 ) -> tuple[Unknown, ...]:
-    """The parameters of an effect as unknowns; one for all segments, or with `split` one for each."""
+    """The parameters of an effect as unknowns; one for all segments, and of `shared` ones for all drives, or
+    with `split` one for each. With `drive` the `shared` ones are of that drive alone, from 0 on; those of
+    other drives stay neutral."""
     found = []
     at = 0
     every = columns(get_effect(name), wiring)
@@ -177,14 +192,18 @@ def effect_unknowns(
         count = wiring.count(parameter.per)
         own = range(at, at + count)
         at += count
-        tied = parameter.per == "segment" and not split
+        tied = (parameter.per == "segment" or parameter.shared) and not split and count > 0
         groups = [(parameter.name, tuple(own))] if tied else [(every[c], (c,)) for c in own]
+        if parameter.shared and drive is not None:
+            groups = [(every[at - count + drive], (at - count + drive,))]
         for label, places in groups:
             if label in drop:
                 continue
             begin = (start or {}).get(parameter.name, parameter.starts[0])
             log = parameter.shape and parameter.bounds[0] > 0.0
             mean = parameter.starts[len(parameter.starts) // 2] if parameter.shape else parameter.neutral
+            if parameter.shape and parameter.name in (start or {}):  # found otherwise
+                mean = begin
             sd = 1.5 if log else _WIDE * parameter.scale
             found.append(
                 Unknown(

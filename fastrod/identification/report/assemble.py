@@ -97,7 +97,7 @@ def verdict_on(
         floor=floor**2,
         structure=remaining,
         steps=outcome.steps,
-        found=explained.names,
+        found=[_spoken(name, explained.state.model) for name in explained.names],
     )
 
 
@@ -122,7 +122,7 @@ def assemble(
         path = path[:1]
     estimates, correlation = estimates_of(final.model, final.fit)
     classes = _classes(steps, kept)
-    effects = [_effect(name, estimates, classes, path, steps, noise.floor) for name in kept]
+    effects = [_effect(name, final.model, estimates, classes, path, steps, noise.floor) for name in kept]
     wiring = final.model.wiring
     lacks = (
         advice.missing_excitation(explained.search.samples, wiring.bend(np.asarray(samples.log.dl)))
@@ -200,8 +200,14 @@ def _own(state: ModelState, name: str) -> float:
     return float(((with_it - without) ** 2).sum())
 
 
+def _spoken(name: str, model: Model) -> str:
+    drive = model.drive_of(name)
+    return name if drive is None else f"{name} of drive {drive + 1}"
+
+
 def _effect(
     name: str,
+    model: Model,
     estimates: dict[str, Estimate],
     classes: dict[str, list[str]],
     path: list[SearchStage],
@@ -217,6 +223,9 @@ def _effect(
     excess = max(path[0].held_out ** 2 - floor**2, 1e-18)
     gain = (path[at - 1].held_out ** 2 - path[at].held_out ** 2) / excess
     title = (type(get_effect(name)).__doc__ or name).strip().splitlines()[0]
+    drive = model.drive_of(name)
+    if drive is not None:
+        title = f"{title} Only drive {drive + 1} has it."
     return Found(
         name=name,
         title=title,
@@ -224,6 +233,7 @@ def _effect(
         held_out_gain=gain,
         evidence=evidence,
         cannot_be_told_from=classes.get(name, []),
+        drive=None if drive is None else drive + 1,
     )
 
 
@@ -328,13 +338,16 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
         ]
         return SearchStage(name=name, train=errors[0], held_out=errors[1])
 
-    stages = [stage("base", explained.start)]
-    for i in range(1, len(explained.names) + 1):
-        piece = explained.state
-        for name in explained.names[i:]:
-            piece = explained.search.without(piece, name)
-        stages.append(stage(explained.names[i - 1], piece))
-    return stages
+    stages, noise = [stage("base", explained.start)], base.noise.sigma
+    # as the search finds them: taken away from the whole model one by one, effects that correct each other
+    # leave a fit that starts far from where it should end
+    search, piece = explained.search.weighed(explained.start, noise)
+    for name in explained.names[:-1]:
+        added = search.candidate(piece, name).state
+        if added is not None:
+            search, piece = search.weighed(search.refined(added), noise)
+        stages.append(stage(name, piece))
+    return [*stages, *(stage(name, explained.state) for name in explained.names[-1:])]
 
 
 def limits(robot: Robot, samples: LogSamples) -> list[str]:

@@ -52,6 +52,7 @@ def to_json(result: Result) -> dict[str, Any]:
             {
                 "name": found.name,
                 "title": found.title,
+                "drive": found.drive,
                 "parameters": _estimates(found.parameters),
                 "held_out_gain": found.held_out_gain,
                 "evidence": dict(found.evidence),

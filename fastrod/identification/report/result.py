@@ -33,6 +33,8 @@ class Found:
     evidence: Mapping[str, float]
     """z over held-out blocks, BIC, share of the loss, when it was added."""
     cannot_be_told_from: Sequence[str]
+    drive: int | None = None
+    """The one drive that has it, from 1 on; None where it is not one drive's."""
 
 
 @dataclass(frozen=True, kw_only=True)

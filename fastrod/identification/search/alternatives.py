@@ -2,12 +2,13 @@
 
 Each alternative pattern is a few linear columns, some of them found by a scan. They compete with the effects
 on the same terms; where one wins, the verdict is that the cause is not in the library, and of which kind it
-is. They are never part of "after".
+is. They are never part of "after", but for those that an effect stands for: where such a pattern fits, the
+effect is fitted from where the scan has found it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -18,6 +19,7 @@ from fastrod.types import Floats
 
 _LONG = 20.0  # s, of a run in which something can happen
 _TIMES = 48  # change points tried
+_ROWS_AROUND = 400  # the best of them, where a time between two rows is sought
 _FREQUENCIES = (0.08, 3.0)  # Hz, of a line
 _NARROW = 4.0  # lines tried per 1 / duration
 
@@ -35,6 +37,10 @@ class AlternativePattern:
     """(n, n_out, k) over sigma."""
     n_hidden: int
     """Parameters that a scan has chosen, beside the k amplitudes."""
+    start: Mapping[str, float] | None = None
+    """Where the fit of the effect of the same name begins; None where none stands for it in this log."""
+    drive: int | None = None
+    """The one drive that has the effect, from 0 on."""
 
 
 def alternatives(linearised: LinearisedModel, tangent: Floats, residual: Floats) -> list[AlternativePattern]:
@@ -44,7 +50,7 @@ def alternatives(linearised: LinearisedModel, tangent: Floats, residual: Floats)
     families = [_ripple(linearised), _contact(linearised), _attraction(linearised), _patch(linearised)]
     # short runs have no history of their own
     if all(linearised.samples.time[span].max() > _LONG for span in linearised.samples.runs):
-        families += [_bump(linearised), _slip(linearised), _sway(linearised, residual)]
+        families += [_bump(linearised), _slip(linearised, solver), _sway(linearised, residual)]
     for family in families:
         best: tuple[float, AlternativePattern] | None = None
         for alternative in family:
@@ -125,23 +131,33 @@ def _bump(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
         )
 
 
-def _slip(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
-    if not linearised.model.wiring.n_tendons:
+def _slip(linearised: LinearisedModel, solver: _Projected) -> Iterator[AlternativePattern]:
+    """The best drive and time: of some times, then of every row around the best."""
+    wiring, t = linearised.model.wiring, _log_time(linearised)
+    if not wiring.n_tendons:
         return
-    t = _log_time(linearised)
-    wiring = linearised.model.wiring
-    for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
-        step = (t > at).astype(float)
-        for drive in range(wiring.n_drives):
-            pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
-            columns = _weighted(linearised, (linearised.by_length @ pull * step[:, None])[..., None])
-            yield AlternativePattern(
-                "slip",
-                "drift",
-                f"the zero of drive {drive + 1} jumps at {_when(linearised, at)}: its tendon slipped",
-                columns,
-                2,
-            )
+    pulls = [np.where(wiring.drive == drive, wiring.drive_sign, 0.0) for drive in range(wiring.n_drives)]
+    responses = [_weighted(linearised, (linearised.by_length @ pull)[..., None]) for pull in pulls]
+
+    def loss(at: float, drive: int) -> float:
+        return solver.loss(responses[drive] * (t > at)[:, None, None])
+
+    coarse = np.quantile(t, np.linspace(0.03, 0.97, _TIMES))
+    _, k, drive = min((loss(at, d), k, d) for k, at in enumerate(coarse) for d in range(wiring.n_drives))
+    low, high = coarse[max(k - 1, 0)], coarse[min(k + 1, _TIMES - 1)]
+    between = 0.5 * (t[1:] + t[:-1])
+    fine = between[(between > low) & (between < high)][:_ROWS_AROUND]
+    at = float(min([coarse[k], *fine], key=lambda time: loss(time, drive)))
+    one_run = len(linearised.samples.runs) == 1
+    yield AlternativePattern(
+        "slip",
+        "drift",
+        f"the zero of drive {drive + 1} jumps at {_when(linearised, at)}: its tendon slipped",
+        responses[drive] * (t > at)[:, None, None],
+        2,
+        {"at": at} if one_run else None,  # a time of a run is of that run alone
+        drive if one_run and wiring.n_drives > 1 else None,
+    )
 
 
 def _sway(linearised: LinearisedModel, residual: Floats) -> Iterator[AlternativePattern]:

@@ -117,12 +117,12 @@ def _unseen(linearised: LinearisedModel) -> dict[str, Estimate]:
     flat = J.reshape(r.size, J.shape[-1])
     _, sd = model.prior
     H = flat.T @ flat + np.diag(1.0 / sd**2)
-    fixed, wanted = {}, set(model.robot.fit)
+    fixed, requested = {}, set(model.robot.fit)
     posterior = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H)), 0.0)) if len(sd) else sd
     for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
         blind = (
             "stiffness" in u.name
-            and not wanted & {u.name, re.sub(r"segment\.\d+", "segment.*", u.name)}
+            and not requested & {u.name, re.sub(r"segment\.\d+", "segment.*", u.name)}
             and not advice.loaded(samples, model.robot)
         )
         if blind or narrowed > SEEN * prior:

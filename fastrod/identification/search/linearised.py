@@ -8,6 +8,7 @@ solved exactly.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
-from fastrod.effects.executor import act
+from fastrod.effects.executor import Link, act, approached, feels_tip, tip_feedback
 from fastrod.effects.ports import CHANGEABLE
 from fastrod.identification.log.forward import (
     LogSamples,
@@ -33,6 +34,7 @@ from fastrod.types import Floats
 ANGLE = 0.01
 """rad, noise of a measured orientation."""
 _BEND = 2e-3  # rad, step of the slopes by bend
+_BALANCE = 3  # Newton steps; a force that is linear in the tip takes one
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
 
 
@@ -129,8 +131,8 @@ class LinearisedModel:
         self.robot = model.robot_at(theta)
         self.prepared = prepare_log(samples, self.robot, model.wiring)
         self.effects = effects_at(model, theta)
-        self.opened = self.prepared.drive(self.effects)
-        self.pose = rod.solve(*self.prepared.kernel(self.opened), self.robot)
+        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot)
+        self._feedback = self._tip_feedback(self.effects, self.pose.position)[0]
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
         at = self.prepared.drive([each for each in self.effects if self.is_light(each.name)])
@@ -192,7 +194,7 @@ class LinearisedModel:
         """Whether an effect changes only tendon lengths, the tip force or the camera: then no rod need be
         solved for it."""
         what = get_effect(name)
-        if has_memory(what) or what.seam is Seam.SENSING:
+        if has_memory(what) or what.seam is Seam.SENSING or feels_tip(what):
             return True
         key = ("light", name)
         if key not in self._columns_kind:
@@ -241,13 +243,15 @@ class LinearisedModel:
                 else prepare_log(self.samples, robot, model.wiring)
             )
             self.rod.back(self._kept)
-            driven = place.kernel(place.drive(effects_at(model, moved)))
-            pose = self.rod.solve(*driven, robot, self.pose.ok, near=True)
+            opened = place.drive(effects_at(model, moved))
+            opened.tip_force += self._feedback  # held, as with the slopes: `closed` has what it answers
+            pose = self.rod.solve(*place.kernel(opened), robot, self.pose.ok, near=True)
             self._columns[unknown.place] = np.where(pose.ok[:, None], self._difference(pose) / step, 0.0)
         return self._columns[unknown.place]
 
     def driven(self, model: Model, theta: Floats) -> Floats:
-        """(n, 6 + 3k) change of the true pose by tendons and tip forces."""
+        """(n, 6 + 3k) change of the true pose by tendons and tip forces, but for forces that go by the
+        tip."""
         opened = self.prepared.drive([each for each in effects_at(model, theta) if self.is_light(each.name)])
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
@@ -269,6 +273,29 @@ class LinearisedModel:
                 )
         return change
 
+    def _tip_feedback(self, effects: Sequence[Link], tip: Floats) -> tuple[Floats, Floats]:
+        """Tip force of the effects that feel the tip where it is at `tip`, and its slopes (`tip_feedback`);
+        zero without such effects."""
+        felt = [each.on(len(tip)) for each in effects if feels_tip(each.effect)]
+        if not felt:
+            return np.zeros((len(tip), 3)), np.zeros((len(tip), 3, 3))
+        return tip_feedback(felt, self.opened, np.where(self.pose.ok[:, None], tip, 0.0))
+
+    def closed(self, model: Model, theta: Floats, change: Floats) -> Floats:
+        """(n, 6 + 3k) change of the true pose with what the forces of effects that feel the tip make of a
+        `change` at which they were held: their balance with the rod, by its slopes."""
+        effects = [each for each in effects_at(model, theta) if feels_tip(each.effect)]
+        if not effects and not self._feedback.any():
+            return change
+        force, by_force = self._feedback, self.by_force
+        for _ in range(_BALANCE if effects else 0):
+            tip = self.pose.position + change[:, :3]
+            tip = tip + np.einsum("nij,nj->ni", by_force[:, :3], force - self._feedback)
+            target, slopes = self._tip_feedback(effects, tip)
+            force = approached(force, target, slopes, by_force[:, :3])
+        force = force if effects else np.zeros_like(force)
+        return np.asarray(change + np.einsum("nij,nj->ni", by_force, force - self._feedback))
+
     def seen(self, model: Model, theta: Floats, change: Floats) -> PredictedPose:
         """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
         points [m], base frame."""
@@ -284,7 +311,9 @@ class LinearisedModel:
     def residual(self, model: Model, theta: Floats) -> Floats:
         """(n, n_out) weighted."""
         return self.target.residual(
-            self.seen(model, theta, self.driven(model, theta) + self.solved(model, theta))
+            self.seen(
+                model, theta, self.closed(model, theta, self.driven(model, theta) + self.solved(model, theta))
+            )
         )
 
     def slopes(self, model: Model, theta: Floats, residual: Floats) -> Floats:
@@ -307,7 +336,8 @@ class LinearisedModel:
                 )
             elif get_effect(unknown.place[1]).seam is not Seam.SENSING:
                 change = self.driven(model, moved) + solved
-            J[..., j] = (residual - self.target.residual(self.seen(model, moved, change))) / step
+            seen = self.seen(model, moved, self.closed(model, moved, change))
+            J[..., j] = (residual - self.target.residual(seen)) / step
         return J
 
     def fit(self, model: Model, start: Floats, iterations: int) -> Fit:

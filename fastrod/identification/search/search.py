@@ -178,24 +178,54 @@ class Search:
 
     def candidate(self, state: ModelState, name: str) -> Candidate:
         """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
-        its passes."""
+        its passes. Where this log shows that it is one drive's, of that drive alone; where it shows another
+        law of the same cause, that law."""
         if self.spent:
             return _unfitted(name, "not tried: the model hardly converges on this log")
-        drop = self._unseen(state, name)
-        added = state.model.with_effect(name).unknowns[len(state.model.unknowns) :]
+        if trait(get_effect(name), "by_pattern"):
+            found = [
+                c for c in self.pattern_effects(state, self.alternative_candidates(state)) if c.name == name
+            ]
+            return found[0] if found else _unfitted(name, "no pattern of it fits")
+        best = self._candidate(state, name)
+        laws = [name, *(other for other in effect_names() if trait(get_effect(other), "refines") == name)]
+        variants: list[tuple[str, int | None]] = [(law, None) for law in laws[1:] if law not in self.excluded]
+        for law in laws:
+            drive = self._drive(state, law)
+            variants += [] if drive is None else [(law, drive)]
+        for law, drive in variants:
+            other = self._candidate(state, law, drive)
+            best = other if other.passes and _distinct(other, best) else best
+        return best
+
+    def _drive(self, state: ModelState, name: str) -> int | None:
+        """The drive by which alone an effect promises most; None where drives do not differ by it."""
+        count = state.model.wiring.n_drives
+        if count < 2 or not any(p.shared for p in get_effect(name).parameters):
+            return None
+        promises = []
+        for drive in range(count):
+            model = state.model.with_effect(name, drive=drive)
+            promises.append(max(self._promise(state, model, theta) for theta in _starts(state, model, name)))
+        best = int(np.argmax(promises))
+        return best if promises[best] >= _SCREEN * state.fit.loss else None
+
+    def _candidate(self, state: ModelState, name: str, drive: int | None = None) -> Candidate:
+        drop = self._unseen(state, name, drive)
+        added = state.model.with_effect(name, drive=drive).unknowns[len(state.model.unknowns) :]
         if all(u.name.partition(".")[2] in drop for u in added if not u.shape):
             shown_by = trait(get_effect(name), "excited_by") or "no response"
             return _unfitted(name, f"this log does not excite it: {shown_by}")
-        model = state.model.with_effect(name, drop=drop)
+        model = state.model.with_effect(name, drop=drop, drive=drive)
         fits = self._from_starts(state, model, name)
         if fits is None:
             n_more = len(model.unknowns) - len(state.model.unknowns)
             return _unfitted(name, "its slopes promise nothing", n_more)
         return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
-    def _unseen(self, state: ModelState, name: str) -> list[str]:
+    def _unseen(self, state: ModelState, name: str, drive: int | None) -> list[str]:
         """Size parameters of an effect that this log does not move at all: left at neutral."""
-        model = state.model.with_effect(name)
+        model = state.model.with_effect(name, drive=drive)
         n = len(state.model.unknowns)
         theta = np.concatenate([state.theta, model.start[n:]])
         at_zero = theta.copy()
@@ -215,36 +245,8 @@ class Search:
 
     def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
         linearised, n = state.linearised, len(state.model.unknowns)
-        added = model.unknowns[n:]
-        starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
-        # per-segment and per-drive columns share their parameter's starts
-        own = [
-            starts[
-                next(
-                    key
-                    for key in sorted(starts, key=len, reverse=True)
-                    if u.name.partition(".")[2].startswith(key)
-                )
-            ]
-            for u in added
-        ]
-        grouped = list(dict.fromkeys(tuple(s) for s in own))
-        combos = list(product(*grouped))[: 2 * _STARTS]
-        combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
         amplitudes = state.fit.theta[n:]
-        promising = []
-        for combo in combos:
-            pick = dict(zip(grouped, combo, strict=True))
-            theta = np.concatenate(
-                [
-                    state.theta,
-                    [
-                        u.outside(float(np.clip(pick[tuple(s)], *u.bounds)))
-                        for u, s in zip(added, own, strict=True)
-                    ],
-                ]
-            )
-            promising.append((self._promise(state, model, theta), theta))
+        promising = [(self._promise(state, model, theta), theta) for theta in _starts(state, model, name)]
         promising.sort(key=lambda pair: -pair[0])
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
@@ -336,31 +338,71 @@ class Search:
             made.append(self.judged(state, with_it, alternative.name, alternative))
         return made
 
+    def pattern_effects(self, state: ModelState, patterns: Sequence[Candidate]) -> list[Candidate]:
+        """The effects that stand for some of these patterns, each fitted from where its scan has found it."""
+        made = []
+        for candidate in patterns:
+            pattern = candidate.alternative
+            if pattern is None or pattern.start is None:
+                continue
+            name = pattern.name
+            if name in state.model.effects or name in self.excluded:
+                continue
+            model = state.model.with_effect(name, pattern.start, drive=pattern.drive)
+            n = len(state.model.unknowns)
+            theta = np.concatenate([state.theta, model.start[n:]])
+            fit = self._fit(state.linearised, model, theta, state.fit.theta[n:], state.alternatives, _MANY)
+            with_it = self._state(model, state.linearised, fit, state.alternatives)
+            made.append(self.judged(state, with_it, name))
+        return made
+
     # ------------------------------------------------------------ stages
 
     def names(self, state: ModelState) -> list[str]:
         """Effects that may be tried."""
         n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
+        refined = {trait(get_effect(name), "refines") for name in state.model.effects}
         return [
             name
             for name in effect_names()
             if name not in state.model.effects
+            and name not in refined
+            and not trait(get_effect(name), "refines")
+            and not trait(get_effect(name), "by_pattern")
             and name not in self.excluded
             and trait(get_effect(name), "least_segments") <= n_segments
             and (driven or get_effect(name).seam.name != "ACTUATION")
         ]
 
     def stage(self, state: ModelState, *, with_alternatives: bool = True) -> SearchStep:
-        """Try everything beside `state`; take the best, if any passes."""
+        """Try everything beside `state`; take the best, if any passes. Effects of last resort are tried where
+        no other passes: they could stand in for several."""
+        names = self.names(state)
+        last = [name for name in names if trait(get_effect(name), "last_resort")]
+        tried = self._tried(state, [name for name in names if name not in last])
+        step = self.choose(state, tried, with_alternatives=with_alternatives)
+        if not last or (step.taken is not None and step.taken.alternative is None):
+            return step
+        more = self.choose(state, self._tried(state, last), with_alternatives=False)
+        every = (*step.candidates, *more.candidates)
+        if more.taken is None or (step.taken is not None and _clearly_better(step.taken, more.taken)):
+            return replace(step, candidates=every)
+        return replace(more, candidates=every)
+
+    def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
         tried = []
-        for name in self.names(state):
+        for name in names:
             self.report(name)
             tried.append(self.candidate(state, name))
-        return self.choose(state, tried, with_alternatives=with_alternatives)
+        return tried
 
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
         they beat it clearly."""
+        others = self.alternative_candidates(state) if with_alternatives else []
+        effects = self.pattern_effects(state, others)
+        tried = [*tried, *effects]
+        others = [c for c in others if not any(c.name == one.name and one.passes for one in effects)]
         fitted = sorted(
             (c for c in tried if c.state is not None and c.z > 1.0 and c.fraction > FRACTION_ACCEPT),
             key=lambda c: -c.fraction,
@@ -382,15 +424,9 @@ class Search:
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = best_of(passing)
-        alternative = None
-        if with_alternatives:
-            others = self.alternative_candidates(state)
-            tried += others
-            alternative = best_of([c for c in others if c.passes])
-        if alternative is not None and (
-            best is None
-            or (advantage(alternative, best) > BIC_RIVAL and z_between(alternative, best) > Z_RIVAL)
-        ):
+        tried += others
+        alternative = best_of([c for c in others if c.passes])
+        if alternative is not None and (best is None or _clearly_better(alternative, best)):
             return SearchStep(state, tuple(tried), alternative)
         if best is None:
             return SearchStep(state, tuple(tried), None)
@@ -507,6 +543,43 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
+    """Where fits of `model` begin, which has an effect more than `state`: its parameters' starts."""
+    added = model.unknowns[len(state.model.unknowns) :]
+    starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
+    # per-segment and per-drive columns share their parameter's starts
+    own = [
+        starts[
+            next(
+                key
+                for key in sorted(starts, key=len, reverse=True)
+                if u.name.partition(".")[2].startswith(key)
+            )
+        ]
+        for u in added
+    ]
+    grouped = list(dict.fromkeys(tuple(s) for s in own))
+    combos = list(product(*grouped))[: 2 * _STARTS]
+    combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
+    made = []
+    for combo in combos:
+        pick = dict(zip(grouped, combo, strict=True))
+        begin = [
+            u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)
+        ]
+        made.append(np.concatenate([state.theta, begin]))
+    return made
+
+
+def _distinct(one: Candidate, other: Candidate) -> bool:
+    """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
+    return other.state is None or _clearly_better(one, other)
+
+
+def _clearly_better(one: Candidate, other: Candidate) -> bool:
+    return advantage(one, other) > BIC_RIVAL and z_between(one, other) > Z_RIVAL
 
 
 def _unfitted(name: str, why: str, n_parameters: int = 0) -> Candidate:
