@@ -87,7 +87,14 @@ def identify(
     candidates = _candidates(base, max_effects, progressed)
     outcome = _needed(base, candidates, max_effects)
     progressed("prediction on all samples", most - 1, most)
-    remaining = residual_structure(some, model.wiring, outcome.last.fit.residual, noise_lag1=base.noise.lag1)
+    remaining = residual_structure(
+        some,
+        model.wiring,
+        outcome.last.fit.residual,
+        noise_lag1=base.noise.lag1,
+        correlation=base.search.row_correlation,
+        doubt=base.noise.uncertainty,
+    )
     explained = explain(log, base, outcome)
     grounds = verdict_on(base, outcome, explained, remaining)
     result = assemble(log, base, outcome, explained, remaining, grounds)
