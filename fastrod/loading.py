@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from fastrod.errors import EffectError, UnknownNameError, shown
@@ -20,6 +21,17 @@ def load_robot(source: str | Path) -> Robot:
     if robot.effects:
         check_effects(robot, f"robot file {shown(str(source))}")
     return robot
+
+
+def with_line_density(robot: Robot, density: float | None) -> Robot:
+    """The robot with this mass per length [kg/m] in all its segments, or as it is for None; lumps stay.
+
+    Raises `RobotError` for a density that cannot be.
+    """
+    if density is None:
+        return robot
+    segments = tuple(replace(segment, line_density=density) for segment in robot.segments)
+    return replace(robot, segments=segments)
 
 
 def check_effects(robot: Robot, where: str) -> None:

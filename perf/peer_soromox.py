@@ -7,58 +7,22 @@ matrix and its forward kinematics, differentiated and compiled by JAX as one wou
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-import numpy as np
+from appendix_j import BENDING, LENGTH, Peer, Rung, Solve
+from soromox_rod import Made, SoromoxRod, compiled
 
-from appendix_j import BENDING, LENGTH, Array, Peer, Rung, Solve
-
-_RADIUS, _DENSITY = 4e-3, 1e3  # m, kg/m^3: without influence on the answer
 _SMALL = 1e-9  # of the last step, in curvature times length
 _MOST = 30
-
-
-def _link(segments: int, straight: Sequence[float]) -> Any:
-    from soromox.systems.components import LinkSpec
-
-    young = BENDING / (0.25 * math.pi * _RADIUS**4)
-    size = {"length": LENGTH / segments, "radius": _RADIUS, "density": _DENSITY}
-    stiffness = {"young_modulus": young, "shear_modulus": young / 3.0}
-    return LinkSpec.circular(**size, **stiffness, reference_strain=list(straight))
-
-
-def _pcs(segments: int) -> tuple[Any, int, Callable[[Any], Any]]:
-    """Robot, degrees of freedom, and (along, across) of the tip from them."""
-    import jax.numpy as jnp
-    from soromox.systems.pcs import PlanarPCS, PlanarPCSStructure
-
-    selector = jnp.array([True, False, False] * segments)
-    bending_only = PlanarPCSStructure(num_gauss_points=5, strain_selector=selector)
-    links = [_link(segments, (0.0, 1.0, 0.0)) for _ in range(segments)]
-    robot = PlanarPCS.from_links(links, structure=bending_only, gravity=jnp.zeros(2), base_pose=jnp.zeros(3))
-    return robot, segments, lambda q: robot.forward_kinematics_tips(q)[-1][1:]
-
-
-def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
-    """One segment, its curvature in the plane a Legendre series of this order, over so many Gauss points."""
-    import jax.numpy as jnp
-    from soromox.systems.components import JointSpec
-    from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
-
-    basis = StrainBasisSpec(type="legendre", strain_selector=("kappa_z",), basis_order=order)
-    link = _link(1, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
-    segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points)
-    base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    robot = GVS.from_segments([segment], gravity=jnp.zeros(3), base_pose=base)
-    return robot, order + 1, lambda q: robot.forward_kinematics_tips(q)[-1][:2, 3]
+_ROD = SoromoxRod(length=LENGTH, bending=BENDING, radius=4e-3, line_density=0.05)
+"""Radius and density are without influence on the answer."""
 
 
 @contextmanager
-def _newton(make: Callable[[], tuple[Any, int, Callable[[Any], Any]]], together: bool) -> Iterator[Solve]:
+def _newton(make: Callable[[], Made], together: bool) -> Iterator[Solve]:
     import jax
 
     with jax.enable_x64(True):
@@ -81,15 +45,10 @@ def _newton(make: Callable[[], tuple[Any, int, Callable[[Any], Any]]], together:
             q, _, _ = jax.lax.while_loop(lambda state: (state[1] > _SMALL) & (state[2] < _MOST), body, start)
             return tip(q)[::-1]
 
-        compiled = jax.jit(jax.vmap(one) if together else one)
-
-        def solve(force: Array) -> Array:
-            return np.asarray(compiled(force) if together else [compiled(across) for across in force])
-
-        yield solve
+        yield compiled(one, together)
 
 
-def _rung(label: str, make: Callable[[], tuple[Any, int, Callable[[Any], Any]]]) -> Rung:
+def _rung(label: str, make: Callable[[], Made]) -> Rung:
     return Rung(label, partial(_newton, make, False), partial(_newton, make, True))
 
 
@@ -107,11 +66,11 @@ def _peer(name: str, same: str, rungs: Sequence[Rung]) -> Peer:
 PCS = _peer(
     "PCS",
     "constant curvature a segment, plane, shear and stretch left out by its own choice of strains.",
-    [_rung(f"{n} segment{'s' * (n > 1)}", partial(_pcs, n)) for n in (1, 4, 16)],
+    [_rung(f"{n} segment{'s' * (n > 1)}", partial(_ROD.pcs, n)) for n in (1, 4, 16)],
 )
 GVS = _peer(
     "GVS",
     "one segment in space, its curvature in the plane a Legendre series, every other strain left out.",
     # 5 points are its least; each setting takes long to build and to compile
-    [_rung(f"order {n}, {m} points", partial(_gvs, n, m)) for n, m in ((0, 5), (1, 6), (3, 12))],
+    [_rung(f"order {n}, {m} points", partial(_ROD.gvs, n, m)) for n, m in ((0, 5), (1, 6), (3, 12))],
 )

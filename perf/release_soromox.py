@@ -3,53 +3,16 @@ JAX, bending alone free."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-import numpy as np
-
-from appendix_j import Array, Peer, Rung, Solve
+from appendix_j import Peer, Rung, Solve
 from release import BENDING, DENSITY, END, LENGTH, PULL, RADIUS, TIMES
+from soromox_rod import Made, SoromoxRod, compiled
 
-Made = tuple[Any, int, Callable[[Any], Any]]
-"""Robot, degrees of freedom, and (along, across) of the tip from them."""
-
-
-def _link(segments: int, straight: Sequence[float]) -> Any:
-    from soromox.systems.components import LinkSpec
-
-    area = math.pi * RADIUS**2
-    young = BENDING / (0.25 * area * RADIUS**2)
-    size = {"length": LENGTH / segments, "radius": RADIUS, "density": DENSITY / area}
-    stiffness = {"young_modulus": young, "shear_modulus": young / 3.0}
-    return LinkSpec.circular(**size, **stiffness, reference_strain=list(straight))
-
-
-def _pcs(segments: int) -> Made:
-    import jax.numpy as jnp
-    from soromox.systems.pcs import PlanarPCS, PlanarPCSStructure
-
-    selector = jnp.array([True, False, False] * segments)
-    bending_only = PlanarPCSStructure(num_gauss_points=5, strain_selector=selector)
-    links = [_link(segments, (0.0, 1.0, 0.0)) for _ in range(segments)]
-    robot = PlanarPCS.from_links(links, structure=bending_only, gravity=jnp.zeros(2), base_pose=jnp.zeros(3))
-    return robot, segments, lambda q: robot.forward_kinematics_tips(q)[-1][1:]
-
-
-def _gvs(order: int, points: int) -> Made:
-    import jax.numpy as jnp
-    from soromox.systems.components import JointSpec
-    from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
-
-    basis = StrainBasisSpec(type="legendre", strain_selector=("kappa_z",), basis_order=order)
-    link = _link(1, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
-    segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points)
-    base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    robot = GVS.from_segments([segment], gravity=jnp.zeros(3), base_pose=base)
-    return robot, order + 1, lambda q: robot.forward_kinematics_tips(q)[-1][:2, 3]
+_ROD = SoromoxRod(length=LENGTH, bending=BENDING, radius=RADIUS, line_density=DENSITY)
 
 
 @contextmanager
@@ -81,12 +44,7 @@ def _swing(make: Callable[[], Made], rtol: float, together: bool) -> Iterator[So
             )
             return jax.vmap(tip)(moved.y[:, :n])[:, ::-1]
 
-        compiled = jax.jit(jax.vmap(one) if together else one)
-
-        def solve(force: Array) -> Array:
-            return np.asarray(compiled(force) if together else [compiled(across) for across in force])
-
-        yield solve
+        yield compiled(one, together)
 
 
 def _peer(name: str, same: str, *settings: tuple[str, Callable[[], Made], float]) -> Peer:
@@ -106,13 +64,13 @@ def _peer(name: str, same: str, *settings: tuple[str, Callable[[], Made], float]
 PCS = _peer(
     "PCS",
     "constant curvature a segment, plane, shear and stretch left out by its own choice of strains.",
-    *((f"{n} segments", partial(_pcs, n), to) for n, to in ((3, 1e-3), (5, 1e-3), (8, 1e-3))),
+    *((f"{n} segments", partial(_ROD.pcs, n), to) for n, to in ((3, 1e-3), (5, 1e-3), (8, 1e-3))),
 )
 GVS = _peer(
     "GVS",
     "one segment in space, its curvature in the plane a Legendre series, every other strain left out.",
     *(
-        (f"order {n}, {m} points", partial(_gvs, n, m), to)
+        (f"order {n}, {m} points", partial(_ROD.gvs, n, m), to)
         for n, m, to in ((1, 6, 1e-3), (2, 8, 1e-3), (3, 8, 1e-4))
     ),
 )

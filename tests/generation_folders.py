@@ -9,7 +9,8 @@ from typing import Any
 import pyarrow.parquet as parquet
 
 import fastrod
-from fastrod.generation import Plan, Shapes
+from fastrod.generation import Plan, Shapes, Trajectories
+from fastrod.loading import with_line_density
 from fastrod.model.robotfile import dumps
 
 
@@ -17,6 +18,13 @@ def small(count: int = 600, shard_rows: int = 50, seed: int = 3, **words: Any) -
     """Shapes of the prototype in tiny shards."""
     work = Shapes(robot=dumps(fastrod.load_robot("prototype")), **words)
     return Plan(work=work, count=count, shard_rows=shard_rows, seed=seed)
+
+
+def moving(count: int = 2, seed: int = 0, **words: Any) -> Plan:
+    """A few short episodes of the prototype with 0.1 kg/m, in motion, in one shard."""
+    heavy = with_line_density(fastrod.load_robot("prototype"), 0.1)
+    given = {"robot": dumps(heavy), "dynamics": True, "steps": 12, "dt": 0.004} | words
+    return Plan(work=Trajectories(**given), count=count, shard_rows=count, seed=seed)
 
 
 def bits(folder: Path) -> dict[str, str]:

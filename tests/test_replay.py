@@ -16,7 +16,8 @@ from truth import plant
 
 from fastrod.errors import LogError
 from fastrod.identification.log.inputs import inputs, tendon_length
-from fastrod.identification.log.replay import DENSE, Replay, draw, replay, table, write
+from fastrod.identification.log.replay import Replay, replay
+from fastrod.identification.log.replay_output import DENSE, draw, table, write
 from fastrod.logs.runlog import RunLog, read_log, write_log
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot

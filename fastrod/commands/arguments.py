@@ -203,6 +203,18 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         action="store_true",
         help="begin with the robot's demo motion; scenes always begin with their script",
     )
+    view.add_argument(
+        "--dynamics",
+        action="store_true",
+        help="a robot with inertia: pull its tip, let go, and it rings; in slow motion if you like",
+    )
+    view.add_argument(
+        "--line-density",
+        type=float,
+        metavar="KG/M",
+        help="with --dynamics: mass per length of all segments (default: the robot's)",
+    )
+    view.add_argument("--dt", type=float, metavar="S", help="with --dynamics: time step (default: 0.001 s)")
     view.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
     view.add_argument(
         "--host",
@@ -526,12 +538,13 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
         metavar="N",
         help="radius of the ball of tip forces (default: 2 EI/l^2 of the robot)",
     )
-    shapes.add_argument(
-        "--line-density",
-        type=float,
-        metavar="KG/M",
-        help="mass per length, for the self-weight (default: the robot's)",
-    )
+    for kind, what in ((shapes, "for the self-weight"), (rollouts, "for self-weight and inertia")):
+        kind.add_argument(
+            "--line-density",
+            type=float,
+            metavar="KG/M",
+            help=f"{'robot: ' if kind is rollouts else ''}mass per length, {what} (default: the robot's)",
+        )
     shapes.add_argument(
         "--tolerance", type=float, metavar="M", help="largest boundary residual (default: 1e-6)"
     )
@@ -557,6 +570,13 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     _add_options(rollouts)
     rollouts.add_argument("--steps", type=int, metavar="N", help="robot: of an episode (default: 200)")
     rollouts.add_argument("--dt", type=float, metavar="S", help="robot: time step (default: 0.02)")
+    rollouts.add_argument(
+        "--dynamics",
+        action="store_const",
+        const=True,
+        help="robot: with inertia, so that it rings; rows have the tip's velocity, too. It needs a mass: the "
+        "robot file's line_density, or --line-density",
+    )
     rollouts.add_argument(
         "--bend", type=float, metavar="RAD", help="robot: largest bend of a segment (default: 0.9)"
     )

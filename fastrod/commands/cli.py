@@ -78,7 +78,8 @@ def _demo(arguments: argparse.Namespace) -> int:
 def _replay(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from fastrod.identification.log import replay as room
+    from fastrod.identification.log.replay import replay
+    from fastrod.identification.log.replay_output import table, write
     from fastrod.loading import load_robot
 
     path: Path = arguments.log
@@ -87,14 +88,14 @@ def _replay(arguments: argparse.Namespace) -> int:
         log = log.only(arguments.run)
     out = arguments.out or Path(f"{path.stem}_replay")
     with _folder(out), _progress() as bar:
-        result = room.replay(
+        result = replay(
             log, robot, dynamics=arguments.dynamics, progress=None if bar is None else partial(bar, "replay")
         )
     console = Console()
-    console.print(room.table(result))
+    console.print(table(result))
     if not result.compared.any():
         return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
-    for written in room.write(result, out):
+    for written in write(result, out):
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
     for question in result.questions:  # it has shown what was requested: that is no refusal
         _refuse(question, DONE)
@@ -206,6 +207,9 @@ def _view(arguments: argparse.Namespace) -> int:
         open_browser=not arguments.no_open,
         script=arguments.play,
         server=server,
+        dynamics=arguments.dynamics,
+        line_density=arguments.line_density,
+        dt=arguments.dt,
     )
     return DONE
 
@@ -413,7 +417,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
 def _folder(out: Path | None) -> Iterator[None]:
     """Of what is about to be computed, made before rather than after; gone again where nothing comes of
     it."""
-    from fastrod.identification.log.replay import make_folder
+    from fastrod.logs.folder import make_folder
 
     fresh = out is not None and not out.exists()
     if out is not None:

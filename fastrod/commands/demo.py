@@ -46,7 +46,7 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
     """
     from rich.console import Console
 
-    from fastrod.identification.log.replay import make_folder
+    from fastrod.logs.folder import make_folder
 
     if out is not None:
         make_folder(out)

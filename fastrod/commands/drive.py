@@ -146,7 +146,7 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
     """Excite, identify, plan anew, track; before and after."""
     from rich.console import Console
 
-    from fastrod.identification.log.replay import make_folder
+    from fastrod.logs.folder import make_folder
     from fastrod_device.loop import close_loop
     from fastrod_device.loop_report import show, write
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from fastrod.errors import InputError
@@ -14,7 +14,7 @@ from fastrod.generation.run import Summary, generate
 from fastrod.generation.shapes import Shapes
 from fastrod.generation.sweep import Sweep
 from fastrod.generation.trajectories import Trajectories
-from fastrod.loading import load_robot
+from fastrod.loading import load_robot, with_line_density
 from fastrod.model.robotfile import dumps
 
 if TYPE_CHECKING:
@@ -78,12 +78,7 @@ def _shard_rows(arguments: argparse.Namespace) -> int:
 
 def _robot(arguments: argparse.Namespace, *, density: float | None = None) -> str:
     """The robot as a text, so that the plan needs no other file."""
-    robot = load_robot(arguments.robot)
-    if density is not None:
-        robot = replace(
-            robot, segments=tuple(replace(segment, line_density=density) for segment in robot.segments)
-        )
-    return dumps(robot)
+    return dumps(with_line_density(load_robot(arguments.robot), density))
 
 
 def _given(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -103,15 +98,16 @@ def _rollouts(arguments: argparse.Namespace, options: Mapping[str, object]) -> R
         raise InputError(
             "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R."
         )
-    of_robot = _given(arguments, "steps", "dt", "bend", "speed", "force")
+    of_robot = _given(arguments, "steps", "dt", "bend", "speed", "force", "line_density", "dynamics")
     if arguments.env is None:
         if options or arguments.policy is not None:
             raise InputError(
                 "--policy and --option are of an environment; with --robot the commands are random."
             )
-        return Trajectories(robot=_robot(arguments), effects=tuple(arguments.effect), **of_robot)
+        robot = _robot(arguments, density=of_robot.pop("line_density", None))
+        return Trajectories(robot=robot, effects=tuple(arguments.effect), **of_robot)
     if of_robot or arguments.effect:
-        wrong = f"--{next(iter(of_robot), 'effect')}"
+        wrong = f"--{next(iter(of_robot), 'effect').replace('_', '-')}"
         raise InputError(
             f"{wrong} is of a robot's own motion; with --env give --option NAME=VALUE, such as n_steps=100."
         )

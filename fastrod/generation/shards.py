@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import uuid
@@ -16,8 +17,10 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.generation.columns import Column
 from fastrod.generation.plan import Plan
+from fastrod.generation.trajectories import Trajectories
 
 _HASH, _INDEX, _FAILED, _UNITS = b"fastrod_plan", b"fastrod_shard", b"fastrod_failed", b"fastrod_units"
+_DYNAMICS = b"fastrod_dynamics"
 _NAME = re.compile(r"[a-z]+-(\d{6,})\.parquet")
 _LEVEL = 1  # of zstd: random numbers hardly shrink, whatever the effort
 
@@ -55,6 +58,8 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
             arrow.field(column.name, arrays[-1].type, metadata={"unit": column.unit, "about": column.about})
         )
     about = {_HASH: plan.hash, _INDEX: str(index), _FAILED: str(made.failed), _UNITS: str(made.units)}
+    if isinstance(plan.work, Trajectories):
+        about[_DYNAMICS] = json.dumps(plan.work.dynamics)
     table = arrow.Table.from_arrays(arrays, schema=arrow.schema(kinds, metadata=about))
     path = path_of(plan, folder, index)
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.part")

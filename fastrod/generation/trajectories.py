@@ -9,8 +9,10 @@ from typing import final
 
 import numpy as np
 
+from fastrod.errors import InputError, shown
 from fastrod.generation.columns import Column, numbered, several, within
 from fastrod.generation.draws import in_ball, named, robot_of, with_effects
+from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.simulator import Simulator
@@ -18,6 +20,7 @@ from fastrod.types import Flags, Floats
 
 _HOLD = 1.0  # s between targets, on average
 _POINTS = 8  # steps of a segment
+_MOTION = 1e-3  # s: of the simulator's steps in motion, at most
 
 
 @final
@@ -27,7 +30,8 @@ class Trajectories:
     targets change at random.
 
     The first step is settled, the others are steps of the simulator. What is measured has the drawn effects
-    in it.
+    in it. With `dynamics` the rod has inertia: it starts at rest, and between two rows, while the commands
+    go on evenly, the simulator takes as many even steps as keep each within a millisecond.
     """
 
     robot: str = field(repr=False)
@@ -44,6 +48,8 @@ class Trajectories:
     """Largest rate of a bend [rad/s]."""
     force: float = 0.0
     """Radius of the ball of tip forces [N]; the force stays for an episode."""
+    dynamics: bool = False
+    """The rod has inertia; every segment of the robot needs a line_density, or this raises `InputError`."""
 
     def __post_init__(self) -> None:
         within("steps", self.steps, 1, 10**6, whole=True)
@@ -53,6 +59,10 @@ class Trajectories:
         within("force", self.force, 0.0, math.inf, "N")
         object.__setattr__(self, "effects", named(self.effects))
         SegmentActions(robot_of(self.robot))
+        if not isinstance(self.dynamics, bool):
+            raise InputError(f"dynamics is {shown(self.dynamics)}; it must be True or False.")
+        if self.dynamics:
+            self._simulator(robot_of(self.robot), 1)
 
     @property
     def index(self) -> str:
@@ -62,7 +72,7 @@ class Trajectories:
     @property
     def usual(self) -> int:
         """Episodes of a shard."""
-        return 256
+        return 32 if self.dynamics else 256
 
     def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
         """`steps` rows for each of `count` episodes, one after the other."""
@@ -71,13 +81,12 @@ class Trajectories:
         robots, drawn = zip(*(with_effects(plain, self.effects, rng) for _ in range(count)), strict=True)
         rotation = matrix_from_quaternion(np.array(plain.base_quaternion))
         force = self.force * in_ball(rng, count, 3)
-        simulator = Simulator(
-            list(robots) if self.effects else plain, count, self.dt, _POINTS, outputs="tip", threads=1
-        )
+        simulator = self._simulator(list(robots) if self.effects else plain, count)
         actions, n = SegmentActions(plain), plain.n_segments
         low, high = np.array([segment.extension for segment in plain.segments]).T
         bend, extension = np.zeros((count, n, 2)), np.zeros((count, n))
         aim_bend, aim_extension = bend.copy(), extension.copy()
+        last = np.zeros((count, 3 * n))
         rows: list[tuple[Floats, ...]] = []
         ok: list[Flags] = []
         for step in range(self.steps):
@@ -93,8 +102,14 @@ class Trajectories:
             action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(
                 count, -1
             )
-            given = actions.inputs(action)
-            state = (simulator.step if step else simulator.settle)(**given, tip_force=force @ rotation.T)
+            steps = self._steps if step else 1
+            good = np.ones(count, bool)
+            for k in range(1, steps + 1):  # the last one's inputs are the row's, to the last bit
+                there = action if k == steps else last + (k / steps) * (action - last)
+                given = actions.inputs(there)
+                state = (simulator.step if step else simulator.settle)(**given, tip_force=force @ rotation.T)
+                good &= state.ok
+            last = action
             seen = simulator.measure()
             dl = given["tendon_length"] - plain.rest_tendon_length
             rows.append(
@@ -104,14 +119,15 @@ class Trajectories:
                     seen.tip_position,
                     quaternion_from_matrix(seen.tip_rotation),
                     state.residual[:, None],
+                    np.zeros((count, 0)) if state.velocity is None else state.velocity[:, -1] @ rotation,
                 )
             )
-            ok.append(state.ok)
-        dl, ext, tip, quaternion, residual = (
+            ok.append(good)
+        dl, ext, tip, quaternion, residual, velocity = (
             np.stack(columns, 1).reshape(count * self.steps, -1) for columns in zip(*rows, strict=True)
         )
         good = np.stack(ok, 1).ravel()
-        tip, quaternion = (np.where(good[:, None], a, np.nan) for a in (tip, quaternion))
+        tip, quaternion, velocity = (np.where(good[:, None], a, np.nan) for a in (tip, quaternion, velocity))
         step_of = np.tile(np.arange(self.steps), count)
         columns = [
             Column(
@@ -143,6 +159,10 @@ class Trajectories:
             "",
             "base_from_tip as measured",
         )
+        if self.dynamics:
+            columns += several(
+                ("tip_vx", "tip_vy", "tip_vz"), velocity, "m/s", "of the rod's tip itself, base frame"
+            )
         for name in drawn[0]:
             values = np.repeat([one[name] for one in drawn], self.steps)
             columns.append(Column(name, values, "", "drawn for the episode, in its parameter's unit"))
@@ -151,13 +171,32 @@ class Trajectories:
                 "residual",
                 residual[:, 0].astype(np.float32),
                 "m",
-                "largest boundary residual: how far the observer is behind",
+                "largest boundary residual"
+                + (" of the moving rod" if self.dynamics else ": how far the observer is behind"),
             )
         )
-        columns.append(Column("ok", good, "", "the observer did not diverge"))
+        solver = "Newton's method ended in every step" if self.dynamics else "the observer did not diverge"
+        columns.append(Column("ok", good, "", solver))
         return columns
 
     def failed(self, columns: Sequence[Column]) -> int:
-        """Episodes in which the observer diverged."""
+        """Episodes in which a row is not ok."""
         values = {column.name: np.asarray(column.values) for column in columns}
         return len(np.unique(values["episode"][~values["ok"]]))
+
+    @property
+    def _steps(self) -> int:
+        """Of the simulator, from row to row."""
+        return max(1, math.ceil(self.dt / _MOTION - 1e-9)) if self.dynamics else 1
+
+    def _simulator(self, robot: Robot | list[Robot], count: int) -> Simulator:
+        """Of `count` robots. Raises `InputError` where they cannot move."""
+        return Simulator(
+            robot,
+            count,
+            self.dt / self._steps,
+            _POINTS,
+            outputs="full" if self.dynamics else "tip",  # the velocity is one of what stands along the rod
+            threads=1,
+            dynamics=self.dynamics,
+        )

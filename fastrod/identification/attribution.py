@@ -12,10 +12,11 @@ from dataclasses import replace
 
 from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.questions import read
 from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
-from fastrod.identification.log.unknowns import Model, base_model
+from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
 from fastrod.identification.report.motion import assemble_motion
 from fastrod.identification.report.result import Result

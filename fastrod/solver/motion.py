@@ -117,6 +117,10 @@ class Motions(Statics):
         self._note_call(modal)
         return self._finish_modes(modal, ports, found, ok, rows, only)
 
+    def _use_numbers(self, robot: Robot | None) -> None:
+        if self._modal is not None and robot is not None:
+            self._modal.replace((robot,))
+
     def _prepare(self, modal: ModalSolver, ports: Ports) -> None:
         """What a pass reads beside the ports."""
         modal.params = self._passes.params

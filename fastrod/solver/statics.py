@@ -159,15 +159,25 @@ class Statics:
         self._observe(rows, ports, self._passes.new_shape("tip", True), predict=False)
 
     def settle_ports(
-        self, ports: Ports, params: Params, tolerance: float = 1e-9, rows: Ints | None = None
+        self,
+        ports: Ports,
+        params: Params,
+        tolerance: float = 1e-9,
+        rows: Ints | None = None,
+        robot: Robot | None = None,
     ) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a
-        whole log themselves. `params` may have a row for each robot. Robots that are not in `rows` are not
-        solved, and not `ok`."""
+        whole log themselves. `params` may have a row for each robot; `robot` has the numbers of rods of modes
+        that are not among them: mass, lumps, stretch and shear. Robots that are not in `rows` are not solved,
+        and not `ok`."""
+        self._use_numbers(robot)
         self._reader.problems, self._derived = {}, None
         self._passes.params, self._bare = params, None
         self._passes.remember(False, False, None)
         return self._settle(ports, self._all if rows is None else rows, tolerance)
+
+    def _use_numbers(self, robot: Robot | None) -> None:
+        """Take what only rods of modes read."""
 
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)

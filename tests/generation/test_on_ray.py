@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from generation_folders import bits, rows_of, small
+from generation_folders import bits, moving, rows_of, small
 
 from fastrod.errors import HostError, InputError
 from fastrod.generation import Plan, generate
@@ -65,6 +65,13 @@ def test_ray_goes_on_with_what_processes_began(whole: Path, tmp_path: Path) -> N
     summary = generate(small(), tmp_path, ray="auto", workers=1)
     assert (summary.made, summary.rows) == (8, 600)
     assert bits(tmp_path) == bits(whole)
+
+
+def test_a_moving_rod_is_the_same_on_ray(tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    generate(moving(), here, workers=1)
+    assert generate(moving(), there, ray="auto").failed == 0
+    assert bits(there) == bits(here)
 
 
 def test_an_error_on_a_worker_is_the_drivers(tmp_path: Path) -> None:

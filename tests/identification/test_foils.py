@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from truth import plant
 
 from fastrod.identification.excite import excitation
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import PredictedRod, sample
-from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.model.robotfile import load_robot

@@ -17,8 +17,8 @@ from fastrod import Robot, Simulator
 from fastrod.effects.base import Parameter, Seam, Signal, Static, effect, get_effect, has_memory, signal_of
 from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
-from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route

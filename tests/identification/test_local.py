@@ -13,8 +13,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
-from fastrod.identification.log.unknowns import Model, base_model
+from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 
 N = 40
@@ -168,7 +169,7 @@ def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
     before = here.rod.runs
     here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
-    assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
+    assert here.rod.runs - before <= 4 + 3  # at most what `by_length` and `by_force` took, once
     assert_slopes(here, model, theta, first, TENDONS | CAMERA | FORCE | MEMORY)
 
 

@@ -14,10 +14,10 @@ from fastrod import Robot, Segment, Simulator, Tendon, save_robot
 from fastrod.commands.cli import main
 from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay
 from fastrod.identification.log.replay import replay
-from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Lump
@@ -177,11 +177,28 @@ def test_a_payload_is_a_mass_at_the_tip() -> None:
         replay(replace(log, payload=np.linspace(0.0, 0.01, len(log))), robot(), dynamics=True)
 
 
+def test_what_rest_shows_is_fitted_at_rest() -> None:
+    """Stretch and a lump's mass, from tips at rest: neither needs a time step."""
+    plant, commanded = robot(**TRUE), 1.5 * commands(1, np.arange(80) * 0.025)
+    sim, tips = Simulator(plant), []
+    for dl in commanded:
+        sim.settle(plant.rest_tendon_length + dl)
+        tips.append(sim.measure().tip_position[0])
+    tip = np.array(tips) + 1e-5 * np.random.default_rng(3).normal(size=(80, 3))
+    log = RunLog(name="rest", t=np.arange(80.0), run=np.full(80, "a"), dl=commanded, tip_position=tip)
+    fit = {k: v for k, v in ALL.items() if k.endswith(("axial_stiffness", ".mass"))}
+    given = robot(density=TRUE["density"], pretension=TRUE["pretension"], fit=fit)
+    found = identify(log, given, network=False)
+    for name, true in zip(fit, (TRUE["mass"], TRUE["axial"]), strict=True):
+        estimate = found.base_parameters[name]
+        assert estimate.stderr < 0.4 * estimate.prior_sd
+        assert abs(estimate.value - true) < 3.0 * estimate.stderr, (name, estimate)
+
+
 def test_what_cannot_be_fitted_is_refused() -> None:
     log = recorded(robot(), {"a": 3}, np.arange(50) * 0.01, 0.0, step=1e-3)
-    for target in ("segment.1.damping_time", "segment.*.shear_stiffness", "segment.1.lump.1.mass"):
-        with pytest.raises(RobotError, match="fitted in motion; identify with --dynamics"):
-            base_model(robot(fit={target: {"sd": 1.0}}))
+    with pytest.raises(RobotError, match="fitted in motion; identify with --dynamics"):
+        base_model(robot(fit={"segment.1.damping_time": {"sd": 1.0}}))
     with pytest.raises(RobotError, match="have 1 lumps, counted from 1"):
         base_model(robot(fit={"segment.1.lump.2.mass": {"sd": 1.0}}), dynamics=True)
     stiff = robot(axial=np.inf, fit={"segment.1.axial_stiffness": {"sd": 1.0}})

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.log.base_model import base_model
 from fastrod.logs.runlog import read_log, write_log
 from fastrod.model.robotfile import dumps, loads
 from fastrod_scenes import measured

@@ -62,4 +62,5 @@ def test_without_suction_nothing_is_lifted(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_slippery_cube_is_dropped() -> None:
     sentence = r"^scene pick_gripper: at \d\.\d+ s the cube is 0\.00\d+ m from where it was held"
     with pytest.raises(SceneError, match=sentence):
-        PickGripper(Cube(mass=0.1, friction=0.01)).check()
+        # with less friction still, the fingers first press it into the table
+        PickGripper(Cube(mass=0.1, friction=0.03)).check()

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from rods import rod
 
-from fastrod import load_robot, robot_names, save_robot
+from fastrod import Lump, load_robot, robot_names, save_robot
 from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
@@ -168,6 +168,15 @@ def test_gravity_off_takes_the_sag_away():
     double = FreeWorld(replace(heavy("passive"), gravity=(0.0, 0.0, -2.0 * 9.81)))
     twice = rest(world, still(world, gravity=2.0, payload=0.01))
     assert_allclose(twice, rest(double, still(double, payload=0.01)), atol=1e-7)
+
+
+def test_gravity_acts_on_lumps_too():
+    robot = heavy("passive")
+    lumps = (Lump(at=0.2, mass=0.02),)
+    robot = replace(robot, segments=(replace(robot.segments[0], lumps=lumps),))
+    world, double = FreeWorld(robot), FreeWorld(replace(robot, gravity=(0.0, 0.0, -2.0 * 9.81)))
+    assert_allclose(rest(world, still(world, gravity=0.0)), [0.2, 0.0, 0.0], atol=1e-8)
+    assert_allclose(rest(world, still(world, gravity=2.0)), rest(double, still(double)), atol=1e-7)
 
 
 def test_command_sets_the_tension():

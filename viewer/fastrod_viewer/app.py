@@ -12,7 +12,7 @@ from typing import Any, final
 
 from fastrod.access import Served
 from fastrod.errors import FastrodError, InputError
-from fastrod.loading import load_robot
+from fastrod.loading import load_robot, with_line_density
 from fastrod.logs.link import RobotLink
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -229,9 +229,7 @@ def found(
     none."""
     if isinstance(what, (World, Playback)):
         return what
-    if n_robots > MOST:
-        raise InputError(f"n_robots is {n_robots}; a browser draws up to {MOST}.")
-    if n_robots != 1:
+    if _drawn(n_robots) != 1:
         if not isinstance(what, Robot) and str(what) in names():
             raise InputError(
                 f"{str(what)!r} is a scene, which has its own robots; several in a grid can be "
@@ -247,9 +245,39 @@ def found(
     return open_world(what)
 
 
+def found_in_motion(
+    what: str | Path | World | Robot | Playback,
+    n_robots: int = 1,
+    *,
+    line_density: float | None = None,
+    dt: float | None = None,
+) -> FreeWorld:
+    """Return the world of a robot that has inertia, a name, a path or itself, with `line_density` [kg/m] in
+    place of its own, and a time step `dt` [s]. Raises `FastrodError`, one sentence, where it has no mass or
+    is no robot."""
+    named = isinstance(what, (str, Path)) and str(what) != DEMO_LOG and not is_log(what)
+    if not isinstance(what, Robot) and (not named or str(what) in names()):
+        raise InputError(f"{_title(what)!r} is no robot, and --dynamics goes with one, such as ethz_beam.")
+    robot = what if isinstance(what, Robot) else load_robot(str(what))
+    return FreeWorld(with_line_density(robot, line_density), _drawn(n_robots), dt, dynamics=True)
+
+
+def _title(what: object) -> str:
+    return what.name if isinstance(what, World) else "a log" if isinstance(what, Playback) else str(what)
+
+
+def _drawn(n_robots: int) -> int:
+    """So many robots. Raises `InputError` where a browser would not draw them."""
+    if n_robots > MOST:
+        raise InputError(f"n_robots is {n_robots}; a browser draws up to {MOST}.")
+    return n_robots
+
+
 def _check_link(shown: World | Playback, link: RobotLink | None) -> None:
     if link is None:
         return
+    if isinstance(shown, World) and shown.ringing is not None:
+        raise InputError(f"a robot link goes with a world without inertia; {shown.name!r} rings by itself.")
     if isinstance(shown, Playback):
         raise InputError("a robot link goes with a world, which is its model; a log has none.")
     ours, theirs = shown.robot, link.robot
@@ -286,17 +314,30 @@ def view(
     link: RobotLink | None = None,
     script: bool = False,
     server: Served | None = None,
+    dynamics: bool = False,
+    line_density: float | None = None,
+    dt: float | None = None,
 ) -> None:
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what
     models say to it.
 
-    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings
-    saved. Raises `FastrodError`, one sentence, for what cannot be shown.
+    With `dynamics` a robot has inertia and rings (`found_in_motion`), by its own masses or `line_density`
+    [kg/m], in steps of `dt` [s]. `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does:
+    robots are stopped, recordings saved. Raises `FastrodError`, one sentence, for what cannot be shown.
     """
+    if not dynamics and not (line_density is None and dt is None):
+        given = "--dt" if line_density is None else "--line-density"
+        raise InputError(f"{given} goes with --dynamics: without, nothing has inertia.")
+    if dynamics and robot is not None:
+        raise InputError("--robot goes with a run log, and --dynamics with a robot; give one of them.")
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
-        shown = found(what, robot, n_robots)
+        shown = (
+            found_in_motion(what, n_robots, line_density=line_density, dt=dt)
+            if dynamics
+            else found(what, robot, n_robots)
+        )
         if open_browser:
             app.served.open_browser()
         app.open(shown, link=link, script=script)

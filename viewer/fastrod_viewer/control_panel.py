@@ -79,7 +79,8 @@ class ControlPanel:
             )
             self._listen(frozen, lambda on: teleop.freeze(bool(on)))
         if not world.robot.n_tendons:
-            gui.add_markdown("This robot has no tendons. Load its tip instead: tab *Loads*.")
+            drag = "" if world.ringing is None else "Drag its tip and let go, or load it: tab *Loads*."
+            gui.add_markdown(f"This robot has no tendons. {drag or 'Load its tip instead: tab *Loads*.'}")
         groups = drive_controls(world, teleop)
         for group in [group for group in groups if not group.title or group.title.startswith("Segment")]:
             self._add(group)
@@ -118,7 +119,8 @@ class ControlPanel:
         if not self.session.world.loads or self.session.link is not None:
             self.server.gui.add_markdown("Loads cannot be put on this robot from here.")
             return
-        self._add(load_controls(self.session.world.robot, self.teleop))
+        world = self.session.world
+        self._add(load_controls(world.robot, self.teleop, rings=world.ringing is not None))
         self._button("No loads", lambda: self.teleop.load(tip_force=np.zeros(3), payload=0.0, gravity=1.0))
 
     def _add(self, group: Group) -> None:

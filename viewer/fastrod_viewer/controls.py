@@ -89,8 +89,8 @@ def drive_controls(world: World, teleop: Teleop) -> list[Group]:
     return groups
 
 
-def load_controls(robot: Robot, teleop: Teleop) -> Group:
-    """Tip force, payload, gravity."""
+def load_controls(robot: Robot, teleop: Teleop, *, rings: bool = False) -> Group:
+    """Tip force, payload, gravity; of a robot that `rings` it says that the payload is a weight alone."""
     most = largest_force(robot)
     heaviest = nice(most / 9.81 / _GRAM)
     payload = Control(
@@ -98,7 +98,7 @@ def load_controls(robot: Robot, teleop: Teleop) -> Group:
         low=0.0,
         high=heaviest,
         step=heaviest / 100.0,
-        hint="Mass at the tip.",
+        hint="Weight of this mass at the tip, without its inertia." if rings else "Mass at the tip.",
         get=lambda: teleop.loads[1] / _GRAM,
         put=lambda v: teleop.load(payload=v * _GRAM),
     )

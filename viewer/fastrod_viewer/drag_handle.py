@@ -21,7 +21,7 @@ _HINT = "drag me"
 @final
 class DragHandle:
     """Ball that follows the tip, or the page that drags it; `Teleop` then moves the tip there by inverse
-    kinematics."""
+    kinematics, or pulls by a spring what has inertia."""
 
     def __init__(
         self,

@@ -55,6 +55,7 @@ _OPTION_LABELS = {
     "loads": "Loads",
     "frames": "Tip frame",
 }
+_SPEEDS = {"real time": 1.0, "1/2": 1.0 / 2.0, "1/5": 1.0 / 5.0, "1/10": 1.0 / 10.0, "1/20": 1.0 / 20.0}
 _BODIES = {"backbone and tendons": "backbone", "skin": "skin"}
 
 
@@ -161,7 +162,8 @@ class DrivePage(ViewerPage):
         )
 
     def _can_drag(self) -> bool:
-        return self.world.drivable and self.teleop.actions is not None
+        bends = self.teleop.actions is not None
+        return self.world.drivable and (bends or self.world.ringing is not None)
 
     def _build(self) -> None:
         import viser
@@ -184,6 +186,8 @@ class DrivePage(ViewerPage):
             self.figures = gui.add_html("")
             self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
+            if self.world.ringing is not None:
+                self._slow_motion()
             tabs = gui.add_tab_group()
             drive, loads = (
                 tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS),
@@ -218,11 +222,27 @@ class DrivePage(ViewerPage):
 
     def _keys(self) -> str:
         keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
-        if self._can_drag():
+        if self._can_drag() and self.teleop.actions is not None:
             keys = "<kbd>J</kbd> <kbd>L</kbd> <kbd>I</kbd> <kbd>K</kbd> bend · " + keys
             if (n := min(self.world.robot.n_segments, 9)) > 1:
                 keys += f" · <kbd>1</kbd>–<kbd>{n}</kbd> segment that keys bend"
         return f"<small>{keys}</small>"
+
+    def _slow_motion(self) -> None:
+        """A choice of how fast the world's time goes, beside the clock of the wall."""
+        choice: Any = self.server.gui.add_dropdown(
+            "Slow motion", tuple(_SPEEDS), hint="How fast the world's time goes, where the machine can."
+        )
+
+        def change(event: Any) -> None:
+            if event.client_id is None:
+                return
+            if self._may(event):
+                self.session.speed = _SPEEDS[choice.value]
+            else:
+                choice.value = next(name for name, speed in _SPEEDS.items() if speed == self.session.speed)
+
+        choice.on_update(change)
 
     def _view(self) -> None:
         gui, options = self.server.gui, self.drawing.options
@@ -347,10 +367,11 @@ class DrivePage(ViewerPage):
             )
         if session.far is not None and frame.measured is not None:
             rows += far_rows(session.far, frame.measured)
-        t = self.world.t if frame.measured is None else frame.measured.t
-        rows.append(
-            ("Time", f"{t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else ""))
-        )
+        t, ringing = self.world.t if frame.measured is None else frame.measured.t, self.world.ringing
+        slower = f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else ""
+        rows.append(("Time", f"{t:.{1 if ringing is None else 2}f} s{slower}"))
+        if ringing is not None:
+            rows.append(("Rings at", f"{ringing.frequency:.3g} Hz"))
         if self._latency == self._latency:
             echo = self._echo()
             drawn = f" + {1e3 * echo:.0f} browser" if echo == echo else ""

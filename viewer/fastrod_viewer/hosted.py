@@ -117,7 +117,7 @@ class HostedView(StagedView):
         self._home: Floats = np.zeros(7)  # of the flange, where ManualCommand.base is zero
         self.drivable = self.loads = isinstance(self._stage, SceneStage)
         self.host = self.base_moves = isinstance(self._stage, SceneStage) and self._stage.arm is not None
-        self._loads = Loads(self.robot)
+        self._loads = Loads(self.robot, hosted=True)
         self._bodies = tuple(
             Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3])
             for shape in self._visuals.shapes

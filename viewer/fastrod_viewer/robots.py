@@ -41,8 +41,10 @@ def about(robot: Robot) -> str:
 class Loads:
     """Loads of a manual command: tip force, payload, more or less gravity."""
 
-    def __init__(self, robot: Robot) -> None:
-        self._gravity = np.array(robot.gravity)
+    def __init__(self, robot: Robot, *, hosted: bool = False) -> None:
+        """A robot that is `hosted` has its host's gravity; more or less of it is then a load along the
+        rod."""
+        self._gravity, self._hosted = np.array(robot.gravity), hosted
         density = np.array([segment.line_density for segment in robot.segments])
         # (n_segments, 2, 3) [N/m]
         self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)
@@ -54,7 +56,9 @@ class Loads:
             + command.payload * command.gravity * self._gravity
         )
         more: dict[str, Any] = {"tip_force": force + np.asarray(given.get("tip_force", np.zeros(3)))}
-        if command.gravity != 1.0 and self._weight.any():
+        if command.gravity != 1.0 and not self._hosted:
+            more["gravity"] = command.gravity * self._gravity
+        elif command.gravity != 1.0 and self._weight.any():
             own = np.asarray(given.get("line_force", np.zeros(3)), dtype=np.float64)
             own = own[:, None, None] if own.ndim == 2 else own
             more["line_force"] = own + (command.gravity - 1.0) * self._weight

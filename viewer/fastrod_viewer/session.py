@@ -24,6 +24,7 @@ from fastrod_viewer.world import ManualCommand, World, measure
 RATE = 30.0
 """Pictures a second."""
 _BEHIND = 0.25  # s: a world that falls farther behind runs slower than real time
+_BUSY = 0.8  # of a picture's time: what steps of rods in motion take at most, so that it moves evenly
 _REST = 12  # pictures after the last motion, in which an observer comes to rest
 _SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when commands come quickly
@@ -92,7 +93,7 @@ class Session:
         self._command: ManualCommand | None = None
         self._problem, self._said = "", 0.0
         self._recorded, self._restarts = -np.inf, 0
-        self._pace = 1.0
+        self._pace = self._speed = 1.0
         self._last = time.perf_counter(), world.t
         self._since_step: float | None = None
         self._adopt()
@@ -131,6 +132,21 @@ class Session:
     @paused.setter
     def paused(self, on: bool) -> None:
         self._paused = bool(on)
+        self.wake()
+
+    @property
+    def speed(self) -> float:
+        """Seconds of the world in a second, where the machine can: 1 is real time, less slow motion. Raises
+        `InputError` for what is not above 0 and at most 1, and for less than 1 with a link."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        if not (isinstance(speed, (int, float)) and 0.0 < speed <= 1.0):
+            raise InputError(f"speed is {speed!r}; give a number above 0 and at most 1, real time.")
+        if speed < 1.0 and self.link is not None:
+            raise InputError(f"speed is {speed!r}; a robot at the other end of a link moves in real time, 1.")
+        self._speed = float(speed)
         self.wake()
 
     @property
@@ -261,7 +277,7 @@ class Session:
                 did = self._do_jobs()
                 moves = self._moves()
                 due = (
-                    self._advance(max(due, began - _BEHIND), began, at_once=since is not None)
+                    self._advance(max(due, began - self._latest()), began, at_once=since is not None)
                     if moves
                     else began
                 )
@@ -304,31 +320,37 @@ class Session:
             or self.world.host
             or self.world.robot.effects
             or self.recorder is not None
+            or (self.world.ringing is not None and not self.world.ringing.rests)
         ):
             return True
         return not self.teleop.arrived or time.perf_counter() - self._woken < _REST / RATE
 
+    def _latest(self) -> float:
+        """How late a step may be to be made up for [s]."""
+        return max(_BEHIND, self.world.dt / self._speed)
+
     def _advance(self, due: float, began: float, *, at_once: bool) -> float:
-        """Do the steps of the world up to now, one at least where a command waits for it; return when the
-        next one is due."""
+        """Do the steps of the world up to now, one at least where a command waits for it and the world has no
+        inertia; return when the next one is due."""
         if self.far is not None:
             # late, it is slower: nothing is made up for
             self._try(min(max(began - self._moved, _QUICKEST), 1.0 / RATE))
             self._moved, self._steps = began, 0
             return began
-        dt = self.world.dt
-        steps = int((began - due) / dt + 1e-6)
+        dt, rings = self.world.dt, self.world.ringing is not None
+        apart, most = dt / self._speed, _BUSY / RATE if rings else _BEHIND
+        steps = int((began - due) / apart + 1e-6)
         if self._steps:
-            steps, self._steps = max(1, round(1.0 / RATE / dt)), self._steps - 1
-            due = began - steps * dt
-        elif at_once and steps == 0:
-            steps, due = 1, began - dt
+            steps, self._steps = max(1, round(1.0 / RATE / apart)), self._steps - 1
+            due = began - steps * apart
+        elif at_once and steps == 0 and not rings:  # a step for every command would hurry slow motion
+            steps, due = 1, began - apart
         for _ in range(steps):
             if not self._try(dt):
                 return began
-            if time.perf_counter() - began > _BEHIND:
+            if time.perf_counter() - began > most:
                 return time.perf_counter()
-            due += dt
+            due += apart
         return due
 
     def _try(self, dt: float) -> bool:

@@ -225,10 +225,11 @@ class Teleop:
             self._freeze = bool(frozen)
 
     def drag(self, point: ArrayLike | None) -> None:
-        """Pull the tip toward a point (3,) world [m]; None lets go, and the robot stays as it is."""
+        """Pull the tip toward a point (3,) world [m]; None lets go, and the robot stays as it is. A robot
+        that has inertia is pulled by a spring (`Ringing.pull`), its drives stay, and let go it rings."""
         with self._lock:
             self._pull = None if point is None else np.array(point, dtype=np.float64)
-            if point is None:
+            if point is None and self._world.ringing is None:
                 self.hold()
 
     def hold(self) -> None:
@@ -265,7 +266,11 @@ class Teleop:
     def step(self, dt: float) -> ManualCommand:
         """Return the command for the next `dt` [s]."""
         with self._lock:
-            rate = self._follow_drag(dt) if self._pull is not None else None
+            rate, force, ringing = None, self._tip_force, self._world.ringing
+            if self._pull is not None and ringing is not None:
+                force = force + ringing.pull(self._world.rods[0].state, self._pull)
+            elif self._pull is not None:
+                rate = self._follow_drag(dt)
             goals, now, speeds = self._goals, self._now, self._speeds
             if self.actions is not None:
                 limit = self._action_rates(self.actions, speeds) * dt
@@ -289,7 +294,7 @@ class Teleop:
                 tension=there.tension,
                 base=there.base,
                 base_rate=rate,
-                tip_force=self._tip_force,
+                tip_force=force,
                 payload=self._payload,
                 gravity=self._gravity,
                 freeze=self._freeze,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.solver.state import State
 from fastrod.types import Floats
+
+if TYPE_CHECKING:
+    from fastrod_viewer.ringing import Ringing
 
 
 class Body(NamedTuple):
@@ -93,6 +96,8 @@ class World(ABC):
     """`ManualCommand.base` is heeded."""
     loads: bool
     """`ManualCommand.tip_force`, `payload` and `gravity` are heeded."""
+    ringing: Ringing | None = None
+    """Of rods that have inertia: a drag is a spring on the tip, and they go on moving by themselves."""
 
     @property
     @abstractmethod

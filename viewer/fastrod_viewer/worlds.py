@@ -19,6 +19,7 @@ from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.scene import RodScene
+from fastrod_viewer.ringing import Ringing, time_step
 from fastrod_viewer.robots import Loads, about, actions_of, moved, radii, tendon_inputs
 from fastrod_viewer.scene_graph import grid_places
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
@@ -38,7 +39,8 @@ _COLORS = ((146, 154, 166), (176, 146, 110), (120, 150, 132), (160, 128, 146))
 class SimulatedWorld(World):
     """Worlds of one simulator, without a host.
 
-    A step that is not ok is settled; where that fails too, the simulator is as before the step. Where contact
+    A step that is not ok is settled, but for rods that have inertia; where that fails too, the simulator is
+    as before the step. Where contact
     blocks them the robots stand as far as they came, and continue from there. Either way an `InputError` says
     why.
     """
@@ -65,7 +67,8 @@ class SimulatedWorld(World):
         self._loads = Loads(self.robot)
         self._start = simulator.snapshot()
         self._one: Simulator | None = None
-        if simulator.n_robots > 1 and contact is None and not self.robot.effects:
+        alone = contact is not None or simulator.dynamics or self.robot.effects
+        if simulator.n_robots > 1 and not alone:
             self._one = Simulator(
                 self.robot, 1, self.dt, (simulator.n_points - 1) // self.robot.n_segments, threads=1
             )
@@ -154,7 +157,7 @@ class SimulatedWorld(World):
         done as far as possible: a script continues from there."""
         before = self.simulator.snapshot()
         state = self.simulator.step(**given)
-        if not state.ok.all() and not self._has_contact:
+        if not state.ok.all() and not self._has_contact and not self.simulator.dynamics:
             state = self.simulator.settle(**given)
         done = bool(state.ok.all()) and _finite(state)
         if done or (partial and self._has_contact and _finite(state)):
@@ -170,19 +173,38 @@ class SimulatedWorld(World):
 
 @final
 class FreeWorld(SimulatedWorld):
-    """Robots without surroundings, all driven alike; more than one stand in a grid."""
+    """Robots without surroundings, all driven alike; more than one stand in a grid. With `dynamics` they
+    have inertia, and ring."""
 
     endless = True
     duration = PERIOD
 
     def __init__(
-        self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 6
+        self,
+        robot: Robot,
+        n_robots: int = 1,
+        dt: float | None = None,
+        *,
+        points_per_segment: int = 6,
+        dynamics: bool = False,
     ) -> None:
-        """Arguments of `Simulator`. Raises `InputError`, `RobotError`."""
-        simulator = Simulator(robot, n_robots, dt, points_per_segment, threads=1 if n_robots == 1 else None)
+        """Arguments of `Simulator`; dt is 1/30 s, or with `dynamics` that of `time_step`. Raises
+        `InputError`, also where `dynamics` finds a segment without mass, and `RobotError`."""
+        if dynamics:
+            dt = time_step(robot, points_per_segment, sway(robot, actions_of(robot), 0.0), dt)
+        simulator = Simulator(
+            robot,
+            n_robots,
+            1.0 / 30.0 if dt is None else dt,
+            points_per_segment,
+            threads=1 if n_robots == 1 else None,
+            dynamics=dynamics,
+        )
         super().__init__(simulator, None, grid_places(n_robots, _APART * robot.length))
-        self.name, self.about = robot.name, about(robot)
+        self.name, self.about = robot.name + (" in motion" if dynamics else ""), about(robot)
         self.reset()
+        if dynamics:
+            self.ringing = Ringing(simulator)
 
     def inputs(self, t: float) -> dict[str, Any]:
         """A gentle motion, periodic: bends toward both sides of every segment, or what takes their place."""
@@ -193,7 +215,9 @@ class FreeWorld(SimulatedWorld):
         return {}
 
     def arrived(self, given: dict[str, Any]) -> None:
-        """There is nothing but the robots."""
+        """There is nothing but the robots, which may ring."""
+        if self.ringing is not None:
+            self.ringing.note(self._state, given)
 
     @property
     def bodies(self) -> tuple[Body, ...]:

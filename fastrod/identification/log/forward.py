@@ -115,7 +115,11 @@ class PredictedRod:
         given."""
         self.runs += 1
         state = self._sim.settle_ports(
-            ports, params, self._tolerance, None if rows is None or rows.all() else np.flatnonzero(rows)
+            ports,
+            params,
+            self._tolerance,
+            None if rows is None or rows.all() else np.flatnonzero(rows),
+            replace(robot, effects=()),
         )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
         points = np.zeros((len(state.ok), 0, 3))

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.log.forward import LogSamples, PredictedPose
+from fastrod.identification.log.forward import LogSamples, PredictedPose, sample
 from fastrod.identification.log.inputs import inputs
+from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Lump, Robot
 from fastrod.types import Flags, Floats, Ints
 
@@ -121,6 +122,20 @@ class MotionReplay:
                     "for a whole run: give each its own run."
                 )
         return [float(payload[span.start]) for span in runs]
+
+
+def predict_motion(
+    log: RunLog, robot: Robot, *, points: bool = False, progress: Callable[[int, int], None] | None = None
+) -> tuple[Floats, Floats, Flags]:
+    """Tip (n, 3) and the robot's `log_points` (n, k, 3) at every row of `log`, in its base frame [m], and
+    which rows (n,) are found; k is 0 without `points`. Raises what `MotionReplay.poses` does."""
+    samples = sample(log)
+    every = samples.on(np.arange(len(samples.log)))
+    (pose,) = MotionReplay(every, points=points).poses([robot], progress)
+    tip, ok = np.full((len(log), 3), np.nan), np.zeros(len(log), bool)
+    further = np.full((len(log), len(robot.log_points) if points else 0, 3), np.nan)
+    tip[samples.origin], further[samples.origin], ok[samples.origin] = pose.position, pose.points, pose.ok
+    return tip, further, ok
 
 
 @dataclass(frozen=True, eq=False)

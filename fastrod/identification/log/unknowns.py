@@ -4,7 +4,6 @@ of them makes."""
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,12 +12,11 @@ import numpy as np
 
 from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
-from fastrod.errors import RobotError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 from fastrod.types import Floats
 
-_SEGMENT = {
+SEGMENT_UNITS = {
     "length": "m",
     "bending_stiffness": "N m^2",
     "torsional_stiffness": "N m^2",
@@ -27,26 +25,18 @@ _SEGMENT = {
     "axial_stiffness": "N",
     "shear_stiffness": "N",
 }
-_TENDON = {"offset": "m", "angle": "rad", "compliance": "m/N", "pretension": "N", "gain": "", "zero": "m"}
-MOTION = ("damping_time", "axial_stiffness", "shear_stiffness", "mass")
-"""Parameters that only a fit in motion changes."""
-# a shared one of these is the same number for all; of the others, the same factor
-_ADDED = ("angle", "gain", "zero")
-_POSITIVE: tuple[str, ...] = (
-    "length",
-    "bending_stiffness",
-    "torsional_stiffness",
-    "offset",
-    "axial_stiffness",
-)
-_POSITIVE += ("shear_stiffness",)
-STIFFNESS_SD = 0.3
-"""Relative prior of EI and GJ where the robot file says nothing."""
-FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
-"""Priors of a camera that nobody calibrated: m and rad, m, s."""
-ROUGH = (0.1, 0.2)
-"""Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm
-off."""
+"""Parameters of a segment that can be fitted, and their units."""
+TENDON_UNITS = {
+    "offset": "m",
+    "angle": "rad",
+    "compliance": "m/N",
+    "pretension": "N",
+    "gain": "",
+    "zero": "m",
+}
+"""Those of a tendon."""
+ADDED = ("angle", "gain", "zero")
+"""A shared one of these is the same number for all; of the others, the same factor."""
 _WIDE = 5.0  # typical sizes: width of the prior of an effect's size
 
 
@@ -171,52 +161,6 @@ def known_model(robot: Robot) -> Model:
     return Model(robot, route(robot), tuple(named_effects(robot)), ())
 
 
-def base_model(
-    robot: Robot, *, free_camera: bool = False, registered: bool = False, dynamics: bool = False
-) -> Model:
-    """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
-
-    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. `dynamics`:
-    it is fitted in motion. Raises `RobotError` for a target that is none, naming the nearest, and for one
-    that only motion shows without it.
-    """
-    wiring = route(robot)
-    unknowns: list[Unknown] = []
-    effects = list(named_effects(robot))
-    for target, prior in robot.fit.items():
-        unknowns += _targets(robot, wiring, target, prior)
-        if not dynamics and unknowns[-1].place[1] in MOTION:
-            raise RobotError(
-                f"robot {robot.name!r}: [fit] {target!r} is fitted in motion; identify with --dynamics "
-                "(dynamics=True)."
-            )
-    for kind in ("bending_stiffness", "torsional_stiffness"):
-        if not any(u.place[:2] == ("robot", kind) for u in unknowns):
-            name = f"segment.*.{kind}"
-            numbers = tuple(str(k) for k in range(robot.n_segments))
-            unknowns.append(
-                Unknown(
-                    name,
-                    "x nominal",
-                    1.0,
-                    1.0,
-                    STIFFNESS_SD,
-                    (0.05, 20.0),
-                    0.05,
-                    ("robot", kind, *numbers),
-                    log=True,
-                )
-            )
-    sensor = dict(robot.sensor) | (FREE_CAMERA if free_camera else {})
-    if registered:
-        sensor["registration_sd"] = _wider(
-            sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1])
-        )
-    unknowns += _camera(sensor, robot, wiring)
-    effects += [u.place[1] for u in unknowns if u.place[0] == "effect"]
-    return Model(robot, wiring, tuple(name for name in effect_names() if name in effects), tuple(unknowns))
-
-
 def effect_unknowns(
     name: str,
     wiring: Routing,
@@ -259,172 +203,10 @@ def effect_unknowns(
     return tuple(found)
 
 
-def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, float]) -> list[Unknown]:
-    """The unknowns of one line of `[fit]`."""
-    match = re.fullmatch(r"(segment|tendon)\.(\*|\d+)\.(\w+)", target)
-    kinds = {"segment": _SEGMENT, "tendon": _TENDON}
-    names = [f"{word}.*.{kind}" for word, table in kinds.items() for kind in table]
-    if lump := re.fullmatch(r"segment\.(\d+)\.lump\.(\d+)\.mass", target):
-        return [
-            _lump_unknown(
-                robot, target, (int(lump[1]) - 1, int(lump[2]) - 1), _checked_sd(robot, target, prior)
-            )
-        ]
-    if match is None or match[3] not in kinds[match[1]]:
-        raise RobotError(f"robot {robot.name!r}: [fit] {target!r} is no parameter; {nearest(target, names)}")
-    word, number, kind = match[1], match[2], match[3]
-    count = robot.n_segments if word == "segment" else robot.n_tendons
-    if number != "*" and not 1 <= int(number) <= count:
-        raise RobotError(f"robot {robot.name!r}: [fit] {target!r}; the robot has {word}s 1 to {count}.")
-    sd = _checked_sd(robot, target, prior)
-    which = list(range(count)) if number == "*" else [int(number) - 1]
-    if kind in ("gain", "zero"):
-        return _drive_unknowns(wiring, kind, which, sd, bool(prior.get("shared")), target)
-    nominal = [_nominal(robot, kind, k) for k in which]
-    if not all(map(math.isfinite, nominal)):
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} has no value to begin from; give the segment "
-            f"a finite {kind}."
-        )
-    unit = (_SEGMENT if word == "segment" else _TENDON)[kind]
-    if prior.get("shared") and len(which) > 1:
-        places = ("robot", kind, *map(str, which))
-        if kind in _ADDED:
-            return [Unknown(target, unit, 0.0, 0.0, sd, (-10.0 * sd, 10.0 * sd), 0.3 * sd, places)]
-        middle = float(np.mean(nominal)) or 1.0
-        return [
-            Unknown(
-                target,
-                "x nominal",
-                1.0,
-                1.0,
-                sd / middle,
-                (0.05, 20.0),
-                min(0.05, 0.3 * sd / middle),
-                places,
-                log=True,
-            )
-        ]
-    made = []
-    for k, value in zip(which, nominal, strict=True):
-        least = 0.05 * value if kind in _POSITIVE else 0.0
-        if kind == "angle" or (kind == "pretension" and not robot.tendons[k].unilateral):
-            least = -math.inf
-        low = max(value - 10.0 * sd, least)
-        step = min(0.3 * sd, 0.05 * abs(value) or math.inf)
-        made.append(
-            Unknown(
-                f"{word}.{k + 1}.{kind}",
-                unit,
-                value,
-                value,
-                sd,
-                (low, value + 10.0 * sd),
-                step,
-                ("robot", kind, str(k)),
-            )
-        )
-    return made
-
-
-def _checked_sd(robot: Robot, target: str, prior: Mapping[str, float]) -> float:
-    unknown = [key for key in prior if key not in ("sd", "shared")]
-    if unknown or "sd" not in prior:
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and "
-            "shared = true for one for all."
-        )
-    sd = float(prior["sd"])
-    if not (math.isfinite(sd) and sd > 0.0):
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} has sd {sd!r}; it must be positive: leave "
-            "out what is known."
-        )
-    return sd
-
-
-def _lump_unknown(robot: Robot, target: str, place: tuple[int, int], sd: float) -> Unknown:
-    k, m = place
-    if not (0 <= k < robot.n_segments and 0 <= m < len(robot.segments[k].lumps)):
-        counts = ", ".join(str(len(s.lumps)) for s in robot.segments)
-        raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r}; its segments have {counts} lumps, counted from 1."
-        )
-    mass = robot.segments[k].lumps[m].mass
-    step = min(0.3 * sd, 0.05 * mass or math.inf)
-    bounds = max(mass - 10.0 * sd, 0.0), mass + 10.0 * sd
-    return Unknown(target, "kg", mass, mass, sd, bounds, step, ("robot", "mass", f"{k}.{m}"))
-
-
-def _drive_unknowns(
-    wiring: Routing, kind: str, which: list[int], sd: float, shared: bool, target: str
-) -> list[Unknown]:
-    """Gains and zeros of tendons are those of their drives: no bend tells antagonists of one drive apart."""
-    name = "drum_gain" if kind == "gain" else "encoder_offset"
-    unit = _TENDON[kind]
-    drives = list(dict.fromkeys(int(wiring.drive[t]) for t in which))
-    groups = [tuple(drives)] if shared else [(d,) for d in drives]
-    low = max(-0.95, -10.0 * sd) if kind == "gain" else -10.0 * sd
-    return [
-        Unknown(
-            target if shared else f"tendon.{int(np.flatnonzero(wiring.drive == group[0])[0]) + 1}.{kind}",
-            unit,
-            0.0,
-            0.0,
-            sd,
-            (low, 10.0 * sd),
-            0.1 * sd,
-            ("effect", name, *map(str, group)),
-        )
-        for group in groups
-    ]
-
-
-def _pair(registration: Any) -> tuple[float, float]:
-    """Shift [m] and rotation [rad] of `registration_sd`; one number stands for both."""
-    shift, angle = registration if isinstance(registration, (tuple, list)) else (registration, registration)
-    return float(shift), float(angle)
-
-
-def _wider(given: Any, least: tuple[float, float]) -> tuple[float, float]:
-    shift, angle = _pair(given)
-    return max(shift, least[0]), max(angle, least[1])
-
-
-def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Routing) -> list[Unknown]:
-    """The camera's unknowns, about where the effects of the robot file have it."""
-    made: list[Unknown] = []
-    known = named_effects(robot)
-    shift, angle = _pair(sensor.get("registration_sd", 0.0))
-    for names, sd, effect_name in (
-        ([f"rotation_{a}" for a in "xyz"], angle, "frame_misalignment"),
-        ([f"shift_{a}" for a in "xyz"], shift, "frame_misalignment"),
-        (["x", "y", "z"], float(sensor.get("marker_offset_sd", 0.0)), "marker_offset"),
-        (["delay"], float(sensor.get("latency_sd", 0.0)), "latency"),
-    ):
-        every = columns(get_effect(effect_name), wiring)
-        unit = next(p.unit for p in get_effect(effect_name).parameters if p.name == names[0])
-        table = known.get(effect_name, {})
-        for label in names if sd > 0.0 else []:
-            mean = float(table.get(label, 0.0))
-            low, start = mean - 10.0 * sd, mean
-            if effect_name == "latency":
-                low, start = 0.0, mean or min(0.5 * sd, 0.05)
-            place = ("effect", effect_name, str(every.index(label)))
-            made.append(
-                Unknown(
-                    f"{effect_name}.{label}", unit, start, mean, sd, (low, mean + 10.0 * sd), 0.1 * sd, place
-                )
-            )
-    return made
-
-
-def _nominal(robot: Robot, kind: str, k: int) -> float:
-    if kind in _TENDON:
-        value = getattr(robot.tendons[k], kind)
-        return float(np.mean(value))
-    value = getattr(robot.segments[k], kind)
-    return float(np.mean(value))
+def nominal_of(robot: Robot, kind: str, k: int) -> float:
+    """The value in the robot file of a parameter of tendon or segment `k`; of several, their mean."""
+    owner = robot.tendons[k] if kind in TENDON_UNITS else robot.segments[k]
+    return float(np.mean(getattr(owner, kind)))
 
 
 def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Robot:
@@ -439,9 +221,9 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
         return replace(robot, segments=tuple(segments))
     shared = len(numbers) > 1 or unknown.unit == "x nominal"
     for number in map(int, numbers):
-        was = _nominal(nominal, kind, number)
-        now = value if not shared else was + value if kind in _ADDED else was * value
-        if kind in _SEGMENT:
+        was = nominal_of(nominal, kind, number)
+        now = value if not shared else was + value if kind in ADDED else was * value
+        if kind in SEGMENT_UNITS:
             own: Any = getattr(nominal.segments[number], kind)
             new: Any = tuple(v * now / was for v in own) if isinstance(own, tuple) else now
             if kind == "length":

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fastrod.identification.log.registration import CameraRegistration
-from fastrod.identification.log.replay import make_folder
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Error, Result
@@ -25,6 +24,7 @@ from fastrod.identification.report.wording import (
     words,
 )
 from fastrod.identification.search.solve import Estimate
+from fastrod.logs.folder import make_folder
 from fastrod.model.robotfile import save_robot
 
 if TYPE_CHECKING:

@@ -134,9 +134,7 @@ def _slip(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
         step = (t > at).astype(float)
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
-            columns = _weighted(
-                linearised, (linearised.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None]
-            )
+            columns = _weighted(linearised, (linearised.by_length @ pull * step[:, None])[..., None])
             yield AlternativePattern(
                 "slip",
                 "drift",
@@ -187,7 +185,7 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
             angle = 2.0 * np.pi * dl[:, int(np.flatnonzero(wiring.drive == drive)[0])] / wavelength
-            response = linearised.by_bend @ wiring.bend(pull).ravel()
+            response = linearised.by_length @ pull
             blocks += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
         yield AlternativePattern(
             "ripple",

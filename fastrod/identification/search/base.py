@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,13 +124,13 @@ def _unseen(linearised: LinearisedModel, correlation: Floats) -> dict[str, Estim
     r = linearised.residual(model, model.start)
     J = linearised.slopes(model, model.start, r)
     _, sd = model.prior
-    fixed = {}
+    fixed, asked = {}, set(model.robot.fit)
     spread = covariance_of(J, 1.0 / sd**2, correlation) if len(sd) else np.zeros((0, 0))
     posterior = np.sqrt(np.maximum(np.diag(spread), 0.0))
     for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
         blind = (
             "stiffness" in u.name
-            and u.name not in model.robot.fit
+            and not asked & {u.name, re.sub(r"segment\.\d+", "segment.*", u.name)}
             and not advice.loaded(samples, model.robot)
         )
         if blind or narrowed > SEEN * prior:

@@ -7,6 +7,7 @@ solved exactly.
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -160,21 +161,23 @@ class LinearisedModel:
         return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
 
     @cached_property
-    def by_bend(self) -> Floats:
-        """(n, 6 + 3k, 2 n_segments) per rad."""
-        wiring = self.model.wiring
-        every = []
-        for j in range(2 * wiring.n_segments if wiring.n_tendons else 0):
-            change = np.zeros((1, wiring.n_segments, 2))
-            change.reshape(-1)[j] = _BEND
-            every.append(
-                self._solved(length=self.opened.tendon_length + wiring.tendon_change(change)) / _BEND
-            )
-        return (
-            np.stack(every, axis=-1)
-            if every
-            else np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
-        )
+    def by_length(self) -> Floats:
+        """(n, 6 + 3k, n_tendons) per m of tendon length. A body that can shorten answers to each tendon by
+        itself, any other only to the bend that the lengths ask for."""
+        wiring, n = self.model.wiring, self.model.wiring.n_tendons
+        if not n:
+            return np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
+        if any(math.isfinite(s.axial_stiffness) for s in self.robot.segments):
+            changes, steps, back = np.eye(n), _BEND * wiring.tendon_offset, np.eye(n)
+        else:
+            bends = np.eye(2 * wiring.n_segments).reshape(-1, wiring.n_segments, 2)
+            changes, back = wiring.tendon_change(bends), wiring.bend_from_tendons
+            steps = np.full(len(changes), _BEND)
+        every = [
+            self._solved(length=self.opened.tendon_length + step * change) / step
+            for change, step in zip(changes, steps, strict=True)
+        ]
+        return np.asarray(np.stack(every, axis=-1) @ back)
 
     @cached_property
     def by_force(self) -> Floats:
@@ -248,9 +251,7 @@ class LinearisedModel:
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():
-            change += np.einsum(
-                "nij,nj->ni", self.by_bend, self.model.wiring.bend(moved).reshape(len(opened), -1)
-            )
+            change += np.einsum("nij,nj->ni", self.by_length, moved)
         force = opened.tip_force - self._force
         if force.any():
             change += np.einsum("nij,nj->ni", self.by_force, force)

@@ -9,7 +9,7 @@ from fastrod.types import Floats, Ints
 from ...jit import kernel
 from ..lanes import W, read, write
 from .balance import demands_of_stations
-from .fields import L_CORRECTION, L_DONE, P_L, P_UNEVEN, ModalWork, one_task
+from .fields import L_CORRECTION, L_COUNT, L_DONE, P_L, P_UNEVEN, ModalWork, one_task
 from .follower import follow_tip
 from .gather import (
     ModalBatch,
@@ -83,9 +83,7 @@ def start_settling(robots: Ints, motion: ModalMotion, work: ModalWork) -> None:
 
 
 @kernel
-def note_done(
-    robots: Ints, n_robots: int, done: int, iterations: Ints, residual: Floats, work: ModalWork
-) -> None:
+def note_done(robots: Ints, n_robots: int, iterations: Ints, residual: Floats, work: ModalWork) -> None:
     """Newton steps of each robot, below 0 where they did not end; and the last one, at the length of the
     robot."""
     for w in range(n_robots):
@@ -93,7 +91,8 @@ def note_done(
         for p in range(work.piece.shape[0]):
             length += read(work.piece[p], P_L, w)
         ended = read(work.newton, L_DONE, w) > 0.0 and size >= 0.0
-        iterations[robots[w]] = done if ended else -done
+        taken = int(read(work.newton, L_COUNT, w))
+        iterations[robots[w]] = taken if ended else -taken
         residual[robots[w]] = size * length
 
 
@@ -133,7 +132,7 @@ def pass_of_modes(
         if work.piece[0, P_UNEVEN * W] > 0.0:
             curvature_counted_from(b, work)
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
-        done = minimise(b, batch.pieces.first_tendon, command, work, run.tolerance, least, most)
+        minimise(b, batch.pieces.first_tendon, command, work, run.tolerance, least, most)
         follow_tip(work)
         for p in range(work.piece.shape[0]):
             demands_of_stations(p, b, work)
@@ -141,7 +140,7 @@ def pass_of_modes(
             note_accelerations(robots, n_robots, motion, short, jump, work)
             gather_loads(robots, batch.ports, batch.pieces, b, work)
             continue
-        note_done(robots, n_robots, done, run.iterations, output.shape.residual, work)
+        note_done(robots, n_robots, run.iterations, output.shape.residual, work)
         for w in range(n_robots):
             if run.iterations[robots[w]] > 0 and run.kind == REST:
                 start_from_rest(w, robots[w], motion, run.remembers, work)

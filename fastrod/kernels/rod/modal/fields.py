@@ -34,10 +34,11 @@ C_TH, C_V, COLUMN = 0, 3, 6
 # station: a lump or a point force between the nodes. Mass, force that it must be given, what its inertia is
 # counted from, force from outside; its row of the integration follows
 S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
-# Newton: energies of the trial and before it, damping, size of the step [rad], fraction of it, flags, and the
-# tip's rotation before it
-L_ENERGY, L_BEFORE, L_SIGMA, L_CORRECTION, L_STEP, L_DONE, L_REPLACED, L_ROTATION = 0, 1, 2, 3, 4, 5, 6, 7
-NEWTON = 16
+# Newton: energies of the trial and before it, damping, size [rad] of the step at work and of the robot's last
+# one, fraction of it that is taken, flags, the tip's rotation before it, how many steps the robot took, and
+# which tendons were slack before the step
+L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
+L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 17, 18, 19, 20
 
 
 class ModalWork(NamedTuple):

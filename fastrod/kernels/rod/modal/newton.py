@@ -11,18 +11,22 @@ from fastrod.types import Floats, Ints
 
 from ...jit import inline, kernel
 from ...vec import Vec, dot
-from ..lanes import W, at, get, get_mat, put_mat, read, write, write_at
+from ..lanes import W, at, clear, get, get_mat, put_mat, read, write, write_at
 from .assembly import assemble
 from .cholesky import factor, solve
 from .energy import energy_of_shape
 from .fields import (
+    L_AGAIN,
     L_BEFORE,
     L_CORRECTION,
+    L_COUNT,
     L_DONE,
     L_ENERGY,
     L_REPLACED,
     L_ROTATION,
     L_SIGMA,
+    L_SIZE,
+    L_SLACK,
     L_STEP,
     N_R,
     P_K,
@@ -40,6 +44,8 @@ LONGEST_STEP = 1.0
 """Change of a piece's bend, of one mode [rad], or of strain by a fifth of it."""
 ROUNDING = 1e-12
 """Of the energies: below it a rise is none."""
+TINY = 1e-3
+"""Of the tolerance: after so small a step it does not matter which tendons it slackened."""
 
 
 @kernel
@@ -70,17 +76,19 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
     LONGEST_STEP, none where the Hessian had a negative pivot or the robot is done. Whether every robot's is
     undamped and smaller than `tolerance`: its energy need not be looked at."""
     n_modes, newton, every = b.component.shape[0], work.newton, True
-    for w in range(W):
-        write(newton, L_CORRECTION, w, 0.0)
+    clear(newton[L_SIZE * W : (L_SIZE + 1) * W])
     for p in range(work.piece.shape[0]):
         for a in range(n_modes):
             row, strain = p * n_modes + a, b.component[a] >= 3
             for w in range(W):
                 unit = 5.0 if strain else read(work.piece[p], P_L, w)
-                size, largest = unit * abs(read(work.gradient, row, w)), read(newton, L_CORRECTION, w)
-                write(newton, L_CORRECTION, w, largest if size <= largest else size)  # NaN wins
+                size, largest = unit * abs(read(work.gradient, row, w)), read(newton, L_SIZE, w)
+                write(newton, L_SIZE, w, largest if size <= largest else size)  # NaN wins
     for w in range(W):
-        size, done = read(newton, L_CORRECTION, w), read(newton, L_DONE, w) > 0.0
+        size, done = read(newton, L_SIZE, w), read(newton, L_DONE, w) > 0.0
+        if not done:
+            write(newton, L_CORRECTION, w, size)
+            write(newton, L_COUNT, w, read(newton, L_COUNT, w) + 1.0)
         if not size < 1e300:  # also where it is no number
             write(newton, L_REPLACED, w, 1.0)
         replaced = read(newton, L_REPLACED, w) > 0.0
@@ -101,6 +109,35 @@ def take_step(work: ModalWork) -> None:
 
 
 @inline
+def slack_tendons(work: ModalWork, w: int) -> float:
+    """Which tendons hold nothing by their length, as binary digits."""
+    digits = 0.0
+    for t in range(len(work.stiffness) // W):
+        digits = 2.0 * digits + (1.0 if read(work.stiffness, t, w) == 0.0 else 0.0)
+    return digits
+
+
+@kernel
+def note_slack(work: ModalWork) -> None:
+    """Remember which tendons are slack before a step."""
+    for w in range(W):
+        write(work.newton, L_SLACK, w, slack_tendons(work, w))
+
+
+@kernel
+def went_slack(work: ModalWork, tolerance: float) -> bool:
+    """Whether a tendon of any robot went slack or taut by the step: its Hessian was that of the other branch,
+    and the error is no longer the square of the step. Looked at again, unless the step was tiny."""
+    newton, some = work.newton, False
+    for w in range(W):
+        switched = slack_tendons(work, w) != read(newton, L_SLACK, w)
+        again = switched and read(newton, L_DONE, w) == 0.0 and read(newton, L_SIZE, w) > TINY * tolerance
+        write(newton, L_AGAIN, w, 1.0 if again else 0.0)
+        some = some or again
+    return some
+
+
+@inline
 def rotation_between(after: tuple[float, ...], before: tuple[float, ...]) -> Vec:
     """Rotation vector from one rotation to another that is near, world."""
     a, b = after, before
@@ -111,20 +148,22 @@ def rotation_between(after: tuple[float, ...], before: tuple[float, ...]) -> Vec
 
 
 @kernel
-def accept_step(work: ModalWork, tip: int, tolerance: float) -> int:
+def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> int:
     """Keep or undo the step of every robot, and change its damping; how many are not done. A moment on the
     tip has no energy: its work along the step counts in its place.
 
-    A robot is done where an undamped step changed no bend by more than `tolerance` [rad], 0 for none yet."""
+    A robot is done where an undamped step changed no bend by more than `tolerance` [rad] and there were
+    `enough`; the energy of such a step is not asked for, as it is not where the robots at its side take none
+    that is larger."""
     newton, left = work.newton, 0
     for w in range(W):
         energy, before = read(newton, L_ENERGY, w), read(newton, L_BEFORE, w)
         turned = rotation_between(get_mat(work.node[-1, tip], N_R, w), get_mat(newton, L_ROTATION, w))
         energy -= dot(get(work.outside, 3, w), turned)
-        sigma, size = read(newton, L_SIGMA, w), read(newton, L_CORRECTION, w)
+        sigma, size = read(newton, L_SIGMA, w), read(newton, L_SIZE, w)
         follower = get(work.outside, 12, w)
         # the energy of a force that follows the tip is not the same after the step
-        small = size * read(newton, L_STEP, w) < 1e-6
+        small = size * read(newton, L_STEP, w) < 1e-6 or (sigma == 0.0 and size < tolerance)
         small = small or (size < LONGEST_STEP and dot(follower, follower) > 0.0)
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
         if read(newton, L_DONE, w) > 0.0:
@@ -138,7 +177,7 @@ def accept_step(work: ModalWork, tip: int, tolerance: float) -> int:
         write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
         put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
         write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0)
-        if sigma == 0.0 and size < tolerance:
+        if enough and sigma == 0.0 and size < tolerance and read(newton, L_AGAIN, w) == 0.0:
             write(newton, L_DONE, w, 1.0)
         else:
             left += 1
@@ -154,15 +193,17 @@ def minimise(
     tolerance: float,
     least: int,
     most: int,
-) -> int:
+) -> None:
     """Iterate until every robot's last step was smaller than `tolerance` [rad], at least `least` and at most
-    `most` times; how many steps were taken. Ends with the shape at q."""
+    `most` times. Ends with the shape at q; what a robot did does not depend on its neighbours."""
     newton, tip, known = work.newton, b.width.shape[0], False
     for w in range(W):
         write(newton, L_SIGMA, w, 0.0)
         write(newton, L_DONE, w, 0.0)
+        write(newton, L_COUNT, w, 0.0)
     for i in range(most):
         sweep(b, first_tendon, command, work, True)
+        note_slack(work)
         follows = follow_tip(work)
         assemble(b, first_tendon, work)
         add_damping(b, work)
@@ -177,14 +218,17 @@ def minimise(
                 put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
         take_step(work)
         sweep(b, first_tendon, command, work, False)
-        enough, known = i + 1 >= least, not small
-        if small and enough:
+        known, enough = not small, i + 1 >= least
+        again = went_slack(work, tolerance)
+        if small and enough and not again:
             for w in range(W):
                 write(newton, L_DONE, w, 1.0)
-            return i + 1
+            return
         if not small:
             energy_of_shape(b, command, work, newton[L_ENERGY * W : (L_ENERGY + 1) * W])
-            if accept_step(work, tip, tolerance if enough else 0.0) == 0:
-                return i + 1
+            if accept_step(work, tip, tolerance, enough) == 0:
+                return
+        elif enough:
+            for w in range(W):
+                write(newton, L_DONE, w, 1.0 - read(newton, L_AGAIN, w))
     sweep(b, first_tendon, command, work, False)  # a last step may have been undone
-    return most
