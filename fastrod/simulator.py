@@ -149,6 +149,7 @@ class Simulator(Motions):
         line_force: ArrayLike | None = None,
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
+        follower_line_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
         gravity: ArrayLike | None = None,
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
@@ -167,9 +168,10 @@ class Simulator(Motions):
         `tension` (n_tendons,) of tendon_tension segments [N]; `extension` (n_segments,) [m]; `tip_force` [N],
         `tip_moment` [N m], `line_force` [N/m], each (3,) world, the last also (n_segments, points, 3), linear
         between evenly spaced points, on top of the self-weight; `point_force` (arclength [m], force (3,)
-        world [N]) pairs; `follower_tip_force` (3,) material frame of the tip [N]; `base_pose` (7,) position
-        [m] and quaternion w x y z; `gravity` (3,) world [m/s^2], where that is another at this step than the
-        robot's own.
+        world [N]) pairs; `follower_tip_force` (3,) material frame of the tip [N]; with rods of modes
+        `follower_line_force` [N/m], shaped as `line_force`, in the material frame where it acts; `base_pose`
+        (7,) position [m] and quaternion w x y z; `gravity` (3,) world [m/s^2], where that is another at this
+        step than the robot's own.
 
         The state belongs to the boundary that the last pass predicts for these tendon lengths and tip forces;
         what other inputs change is corrected with the next pass, and shows as `residual`; tendons that
@@ -197,9 +199,11 @@ class Simulator(Motions):
             line_force,
             point_force,
             follower_tip_force,
+            follower_line_force,
             base_pose,
             gravity,
         )
+        self._refuse_follower_line(follower_line_force)
         if self._felt is not None:
             return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
         self._spend(passes, estimate_error)
@@ -217,6 +221,7 @@ class Simulator(Motions):
         line_force: ArrayLike | None = None,
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
+        follower_line_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
         gravity: ArrayLike | None = None,
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
@@ -246,9 +251,11 @@ class Simulator(Motions):
             line_force,
             point_force,
             follower_tip_force,
+            follower_line_force,
             base_pose,
             gravity,
         )
+        self._refuse_follower_line(follower_line_force)
         if self._felt is not None:
             if rows is not None:
                 raise InputError(
@@ -261,6 +268,13 @@ class Simulator(Motions):
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
         return self._settle(ports, read, tolerance, only)
+
+    def _refuse_follower_line(self, force: ArrayLike | None) -> None:
+        if force is not None and self.solver != "modal":
+            raise InputError(
+                "follower_line_force was given, but the observer has line forces of the world only; take "
+                "solver='modal'."
+            )
 
     def _contact_step(
         self,

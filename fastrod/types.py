@@ -76,6 +76,8 @@ class Ports(NamedTuple):
     """(n_robots, 3) [N m]."""
     follower_force: Floats
     """(n_robots, 3) at the tip, material; length 0 if there is none [N]."""
+    follower_line: Floats
+    """(n_robots, n_segments, n_f, 3) material, else as `line_force`; length 0 if there is none [N/m]."""
     line_force: Floats
     """(n_robots, n_segments, n_f, 3); n_f is 1, or 2 n_steps: at the start and the end of every step, linear
     between [N/m]."""

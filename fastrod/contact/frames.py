@@ -55,12 +55,13 @@ def longest_move(start: Floats, end: Floats, ball: Floats) -> Floats:
 
 
 def blended(start: Ports, end: Ports, fraction: Floats) -> Ports:
-    """The inputs a fraction (n,) of the way from `start` to `end`; what has another number of points comes
-    at once."""
+    """The inputs a fraction (n,) of the way from `start` to `end`; what has another number of points, or
+    was not there, comes at once."""
     fields = {}
     for name in Ports._fields:
         a, b = getattr(start, name), getattr(end, name)
-        if name in ("grid", "node_force", "follower_force") or a.shape[1:] != b.shape[1:] or a is b:
+        alike = a.shape[1:] == b.shape[1:] and 0 not in (len(a), len(b))
+        if name in ("grid", "node_force", "follower_force") or not alike or a is b:
             continue
         if name == "base_pose":
             fields[name] = np.ascontiguousarray(between(a, b, fraction))

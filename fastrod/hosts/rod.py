@@ -33,6 +33,7 @@ INPUTS = (
     "line_force",
     "point_force",
     "follower_tip_force",
+    "follower_line_force",
     "gravity",
 )
 """Inputs of a rod beside its base: keyword arguments of `Simulator.step`."""

@@ -11,11 +11,8 @@ from fastrod.kernels.rod.modal.derivatives import AFTER_JUMP, ModalDerivatives, 
 from fastrod.kernels.rod.modal.motion import BDF1, GENERALIZED_ALPHA, REST, ModalMotion
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.modal import ModalSolver, Step
-from fastrod.solver.modal_response import stiffness
+from fastrod.solver.modal_response import full_newton, stiffness
 from fastrod.types import Floats, Ints, Params, Ports
-
-_ENOUGH = 20  # Newton steps on a balance that is nearly solved
-_LAST = 1e-10  # of the largest unknown: a Newton step below it leaves an error of its square
 
 
 class Acting(NamedTuple):
@@ -113,14 +110,8 @@ def _balance(
     how = event.step._replace(scheme=kind)
     step = None if kind == REST else (motion, how, jump)
     wanted = ("hessian", "number") if kind == REST else ("hessian", "number", "damping")
-    q = start.copy()
-    for _ in range(_ENOUGH):
-        found = modal.derive(rows, ports, q, wanted=wanted, step=step)
-        change = np.linalg.solve(stiffness(found)[rows], found.gradient[rows][:, :, None])[:, :, 0]
-        q[rows] -= change
-        if np.abs(change).max(initial=0.0) <= _LAST * max(1.0, float(np.abs(q[rows]).max(initial=0.0))):
-            break
-    else:
+    q, ended = full_newton(modal, rows, ports, start, wanted, step)
+    if not ended.all():
         raise InputError("a step of this trajectory is not solved; take a smaller dt, or more passes.")
     found = modal.derive(rows, ports, q, wanted=wanted, step=step)
     alpha, counted, rate, moved = tables(kind, event, first)

@@ -111,6 +111,7 @@ class Inputs(NamedTuple):
     line_force: ArrayLike | None = None
     point_force: PointForces | None = None
     follower_tip_force: ArrayLike | None = None
+    follower_line_force: ArrayLike | None = None
     base_pose: ArrayLike | None = None
     gravity: ArrayLike | None = None
 
@@ -169,6 +170,9 @@ class Reader:
             follower_force=np.zeros((0, 3))
             if given.follower_tip_force is None
             else self._array("follower_tip_force", given.follower_tip_force, (3,), "N"),
+            follower_line=np.zeros((0, n_segments, 1, 3))
+            if given.follower_line_force is None
+            else self._follower_line(given.follower_line_force, grid),
             line_force=self.line_force(given.line_force, grid),
             node_force=node_force,
             grid=grid,
@@ -269,27 +273,34 @@ class Reader:
         """`Ports.line_force`: self-weight plus what is given, uniform, or linear over each step with the true
         force and moment of that step. `grid` as in `Ports`."""
         weight = self._weight
-        if line_force is None:
-            return weight
+        return weight if line_force is None else weight + self._line("line_force", line_force, grid)
+
+    def _follower_line(self, value: ArrayLike, grid: Floats) -> Floats:
+        line = self._line("follower_line_force", value, grid)
+        shape = len(line), len(self.layout.first_tendon), *line.shape[2:]
+        return np.ascontiguousarray(np.broadcast_to(line, shape))
+
+    def _line(self, name: str, value: ArrayLike, grid: Floats) -> Floats:
+        """As `Ports` has it: (n, 1, 1, 3) of one force, (n, n_segments, 2 n_steps, 3) of samples."""
+        n_segments, n_steps = len(self.layout.first_tendon), self.layout.n_steps
         try:
-            axes = np.ndim(line_force)
+            axes = np.ndim(value)
         except ValueError:
             axes = 0
         if axes <= 2:
-            return weight + self._array("line_force", line_force, (3,), "N/m")[:, None, None, :]
-        n_segments, n_steps = len(self.layout.first_tendon), self.layout.n_steps
-        points = np.shape(line_force)[-2]
-        sampled = self._array("line_force", line_force, (n_segments, points, 3), "N/m")
+            return self._array(name, value, (3,), "N/m")[:, None, None, :]
+        points = np.shape(value)[-2]
+        sampled = self._array(name, value, (n_segments, points, 3), "N/m")
         if points < 2:
             raise InputError(
-                f"line_force has {points} points a segment; give two or more, or one force (3,) for all."
+                f"{name} has {points} points a segment; give two or more, or one force (3,) for all."
             )
         nodes = (
             grid
             if len(grid)
             else np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (1, n_segments, n_steps + 1))
         )
-        return np.ascontiguousarray(weight + _per_step(sampled, nodes))
+        return np.ascontiguousarray(_per_step(sampled, nodes))
 
     def _pose(self, base_pose: ArrayLike) -> Floats:
         pose = self._array("base_pose", base_pose, (7,), "position m, quaternion w x y z")

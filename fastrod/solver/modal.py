@@ -297,10 +297,13 @@ class ModalSolver:
     ) -> ModalDerivatives:
         """Derivatives of these robots at their unknowns or at `unknowns` (n_robots, n_q), zeros for the
         others: at rest, or in a `step` from a motion with its `jump` (`step`). `wanted` names the matrices:
-        hessian, mass (at rest), damping (in a step), number for the last three."""
+        hessian, mass (at rest), damping (in a step), number for the last three, which come along with
+        the hessian under a line force that follows the rod."""
         n, motion = self.n_robots, self.motion if step is None else step[0]
         q = motion.q if unknowns is None else unknowns
         n_q, m = q.shape[1], motion.place.shape[1]
+        followed = len(ports.follower_line) > 0 and "hessian" in wanted
+        n_nodes = len(self.pieces.segment) * len(self.basis.node) if followed else 0
         shapes = {
             "gradient": (n_q,),
             "hessian": (n_q, n_q),
@@ -309,12 +312,14 @@ class ModalSolver:
             "position": (3,),
             "rotation": (3, 3),
             "force": (3,),
+            "line": (n_nodes, 3),
             "damping": (n_q, n_q),
             "number": (m,),
             "number_change": (m, n_q),
             "inertia": (m,),
         }
         left_out = {"hessian", "mass", "damping", "number"} - set(wanted)
+        left_out -= {"number"} if followed else set()
         if "number" in left_out:
             left_out |= {"number_change", "inertia"}
         found = ModalDerivatives(

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
-from fastrod.solver.modal import ModalSolver
+from fastrod.kernels.rod.modal.motion import NODE_VECTORS, ModalMotion
+from fastrod.solver.modal import ModalSolver, Step
 from fastrod.solver.response import ROTATIONS, Relocate, rotation_differences
-from fastrod.types import Floats, Ints, Ports
+from fastrod.types import Flags, Floats, Ints, Ports
 
+_ENOUGH = 20  # Newton steps on a balance that is nearly solved
+_LAST = 1e-10  # of the largest unknown: a Newton step below it leaves an error of its square
 _STEP = 1e-4
 """Of a length or a force, at fixed unknowns: the error of a central difference is of its square, and of
 rounding over it, some 1e-9 both."""
@@ -102,13 +106,42 @@ class ModalLinear:
 
 
 def stiffness(found: ModalDerivatives) -> Floats:
-    """(n_robots, n_q, n_q) derivative of the gradient, with the rotation of a force that follows the tip."""
+    """(n_robots, n_q, n_q) derivative of the gradient, with the rotation of forces that follow the rod."""
+    full, n_nodes = found.hessian, found.line.shape[1]
+    if n_nodes:
+        change = found.number_change[:, : NODE_VECTORS * n_nodes]
+        change = change.reshape(len(full), n_nodes, NODE_VECTORS // 3, 3, -1)  # place, then the directors
+        turned = np.einsum("njk,njkca->njca", found.line, change[:, :, 1:])
+        full = full - np.einsum("njca,njcb->nab", change[:, :, 0], turned, optimize=True)
     if not found.force.any():
-        return found.hessian
+        return full
     x, y, z = found.force.T
     o = np.zeros_like(x)
     across = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
-    return np.asarray(found.hessian + np.swapaxes(found.tip[:, :3], 1, 2) @ across @ found.tip[:, 3:])
+    return np.asarray(full + np.swapaxes(found.tip[:, :3], 1, 2) @ across @ found.tip[:, 3:])
+
+
+def full_newton(
+    modal: ModalSolver,
+    rows: Ints,
+    ports: Ports,
+    start: Floats,
+    wanted: Collection[str] = ("hessian",),
+    step: tuple[ModalMotion, Step, Floats] | None = None,
+) -> tuple[Floats, Flags]:
+    """(n_robots, n_q) unknowns of a balance near `start`, and (n_rows,) who found it, by steps with all of
+    the `stiffness`: slower than the solver's own, and quadratic also where a line force follows the rod.
+    `step` as in `ModalSolver.derive`."""
+    q, ended = start.copy(), np.zeros(len(rows), bool)
+    for _ in range(_ENOUGH):
+        if not len(some := rows[~ended]):
+            break
+        found = modal.derive(some, ports, q, wanted=wanted, step=step)
+        change = np.linalg.solve(stiffness(found)[some], found.gradient[some][:, :, None])[:, :, 0]
+        largest = np.abs(change).max(axis=1, initial=0.0)
+        q[some] -= change
+        ended[~ended] = largest <= _LAST * np.maximum(1.0, np.abs(q[some]).max(axis=1, initial=0.0))
+    return q, ended
 
 
 def _difference(sides: list[ModalDerivatives], delta: float) -> tuple[Floats, Floats]:

@@ -246,4 +246,5 @@ def _loaded(ports: Ports, fraction: Floats) -> Ports:
         line_force=scaled(ports.line_force),
         node_force=scaled(ports.node_force),
         follower_force=scaled(ports.follower_force),
+        follower_line=scaled(ports.follower_line),
     )

@@ -12,6 +12,7 @@ from fastrod.contact.frames import blended
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import MotionShape
 from fastrod.solver.modal import ModalSolver, Step
+from fastrod.solver.modal_response import full_newton
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 _JUMP = 2.0
@@ -24,11 +25,12 @@ _MOVING = (
     "tip_force",
     "tip_moment",
     "follower_force",
+    "follower_line",
     "line_force",
     "node_force",
     "base_pose",
 )
-_LOADS = ("tension", "tip_force", "tip_moment", "follower_force", "line_force", "node_force")
+_LOADS = ("tension", "tip_force", "tip_moment", "follower_force", "follower_line", "line_force", "node_force")
 _RECORDED = 6  # Newton steps at least, of a step that is recorded
 _HALVINGS = 5  # of a step whose Newton's method does not end
 _FRACTIONS = np.linspace(0.125, 1.0, 8)  # of the load, where a robot does not come to rest at once
@@ -69,6 +71,10 @@ class TimeStepper:
             for fraction in _FRACTIONS:
                 some = blended(straight, ports, np.full(modal.n_robots, fraction))
                 arrived = modal.settle(lost, some, *found, tolerance, scheme)
+                if len(ports.follower_line) and len(stray := lost[~arrived]):
+                    q, ended = full_newton(modal, stray, some, modal.motion.q)
+                    modal.motion.q[stray[ended]] = q[stray[ended]]
+                    arrived[~arrived] = modal.settle(stray, some, *found, tolerance, scheme)
             ok[~ok] = arrived
         for name, last in self.change.items():  # who is brought to rest has no change to go on from
             self.change[name] = np.array(last)

@@ -179,6 +179,7 @@ class Input:
         "tip_moment": "tip_moment",
         "follower_tip_force": "follower_force",
         "line_force": "line_force",
+        "follower_line_force": "follower_line",
     }
 
     def __init__(self, modal: ModalSolver, name: str) -> None:
@@ -188,6 +189,7 @@ class Input:
         length = float(np.max(modal.params.rod_length))
         force, moment = float(np.max(modal.params.tension_scale)), float(np.max(modal.params.moment_scale))
         units = {"tendon_length": length, "tip_moment": moment, "line_force": force / length}
+        units["follower_line_force"] = force / length
         self.name, self._delta = name, _STEP * units.get(name, force)
         self.size = len(modal.layout.tendon_segment) if name.startswith("ten") else 3
 
@@ -207,7 +209,7 @@ class Input:
             raise InputError(f"{self.name} was not given; give it, zero if need be, to derive by it.")
         if not step.any():
             return None
-        add = self._delta * (step[:, None, None, :] if port == "line_force" else step)
+        add = self._delta * (step[:, None, None, :] if "line" in port else step)
         sides = [
             at_solution(modal, balance, event.acting.ports._replace(**{port: now + sign * add}))
             for sign in (1.0, -1.0)

@@ -124,13 +124,13 @@ def _unseen(linearised: LinearisedModel, correlation: Floats) -> dict[str, Estim
     r = linearised.residual(model, model.start)
     J = linearised.slopes(model, model.start, r)
     _, sd = model.prior
-    fixed, asked = {}, set(model.robot.fit)
+    fixed, wanted = {}, set(model.robot.fit)
     spread = covariance_of(J, 1.0 / sd**2, correlation) if len(sd) else np.zeros((0, 0))
     posterior = np.sqrt(np.maximum(np.diag(spread), 0.0))
     for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
         blind = (
             "stiffness" in u.name
-            and not asked & {u.name, re.sub(r"segment\.\d+", "segment.*", u.name)}
+            and not wanted & {u.name, re.sub(r"segment\.\d+", "segment.*", u.name)}
             and not advice.loaded(samples, model.robot)
         )
         if blind or narrowed > SEEN * prior:

@@ -10,7 +10,7 @@ from ...jit import kernel
 from ..lanes import W, read, write
 from .balance import demands_of_stations
 from .fields import L_CORRECTION, L_COUNT, L_DONE, P_L, P_UNEVEN, ModalWork, one_task
-from .follower import follow_tip
+from .follower import follow
 from .gather import (
     ModalBatch,
     gather_command,
@@ -133,7 +133,7 @@ def pass_of_modes(
             curvature_counted_from(b, work)
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
         minimise(b, batch.pieces.first_tendon, command, work, run.tolerance, least, most)
-        follow_tip(work)
+        follow(work)
         for p in range(work.piece.shape[0]):
             demands_of_stations(p, b, work)
         if stage == 0:

@@ -16,6 +16,7 @@ from .fields import (
     C_TH,
     C_V,
     H_D,
+    H_FOLLOW,
     H_J,
     H_POS,
     N_POS,
@@ -31,7 +32,7 @@ from .fields import (
     hessian,
     one_task,
 )
-from .follower import follow_tip, tip_motion
+from .follower import follow, tip_motion
 from .gather import ModalBatch
 from .modes import ModalBasis
 from .motion import (
@@ -59,9 +60,9 @@ class ModalDerivatives(NamedTuple):
     """What there is to know of robots near a shape; arrays of length 0 are not wanted."""
 
     gradient: Floats
-    """(n_robots, n_q) of the energy by the unknowns; without what follows the tip it vanishes at rest."""
+    """(n_robots, n_q) of the energy by the unknowns; without what follows the rod it vanishes at rest."""
     hessian: Floats
-    """(n_robots, n_q, n_q) symmetric: without the rotation of a force that follows the tip."""
+    """(n_robots, n_q, n_q) symmetric: without the rotation of forces that follow the rod."""
     mass: Floats
     """(n_robots, n_q, n_q) 2 T = dq/dt . M dq/dt."""
     tip: Floats
@@ -72,6 +73,8 @@ class ModalDerivatives(NamedTuple):
     """(n_robots, 3, 3) of the tip, world_from_material."""
     force: Floats
     """(n_robots, 3) that follows the tip, as it is in the world now [N]."""
+    line: Floats
+    """(n_robots, n_nodes, 3) line force that follows the rod, material, times the extent of its node [N]."""
     damping: Floats
     """(n_robots, n_q, n_q) of a step: derivative of the gradient by what the unknowns' rates are counted
     from, with the other sign."""
@@ -157,6 +160,9 @@ def write_nodes(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, out
         for p in range(n_pieces):
             mass = read(work.piece[p], P_L, w) * read(work.piece[p], P_RHO, w)
             for j in range(n_nodes):
+                if out.line.shape[1] > 0:
+                    extent = b.integral[-1, j] * read(work.piece[p], P_L, w)
+                    scatter(out.line[i, p * n_nodes + j], scale(extent, get(work.history[p, j], H_FOLLOW, w)))
                 node, place = work.node[p, j], get(work.node[p, j], N_POS, w)
                 for f in range(NODE_VECTORS):
                     out.number[i, m + f] = node_number(node, f, w)
@@ -235,7 +241,7 @@ def derivatives_of_modes(
         for a in range(unknowns.shape[1]):
             write(work.q, a, w, unknowns[robots[w], a])
     sweep(batch.basis, batch.pieces.first_tendon, command, work, True)
-    follow_tip(work)
+    follow(work)
     assemble(batch.basis, batch.pieces.first_tendon, work)
     write_tip(robots, n_robots, work, out)
     if len(out.number) > 0:

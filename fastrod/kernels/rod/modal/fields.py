@@ -15,8 +15,9 @@ from ..lanes import LaneMatrix, Lanes, W
 # carries into the positions beyond, moment t x N + C
 N_R, N_POS, N_T, N_F, N_C, N_N, N_MU, NODE = 0, 9, 12, 15, 18, 21, 24, 27
 # given at a node: what its inertia is counted from, position and directors (`motion`), the line force
-# there, and the masses of the directors that stand for its rotary inertia [kg m^2]
-H_POS, H_D, H_LINE, H_J, HISTORY = 0, 3, 12, 15, 18
+# there, the masses of the directors that stand for its rotary inertia [kg m^2], and the two parts of the line
+# force: that of the world, and the one that follows the rod, material
+H_POS, H_D, H_LINE, H_J, H_DEAD, H_FOLLOW, HISTORY = 0, 3, 12, 15, 18, 21, 24
 # interval: u and v at its two Gauss points, rotation vector, W (rotation at its end, world, by each component
 # of u there), the moment that it carries, its own second derivatives (6x6, lower triangle), W . Y of a
 # column; given: u* at the Gauss points, how far K is there from that of the piece, and what the rate of
@@ -24,8 +25,8 @@ H_POS, H_D, H_LINE, H_J, HISTORY = 0, 3, 12, 15, 18
 I_U, I_V, I_O, I_W, I_M, I_LOCAL, I_WORK, I_STAR, I_DK, I_HISTORY = 0, 6, 12, 15, 33, 36, 57, 63, 69, 75
 INTERVAL = 81
 # piece: length; EI_x, EI_y, GJ, then GA_x, GA_y, EA; damping time; mass per length; 1 where K changes along
-# the segments of the batch
-P_L, P_K, P_TAU, P_RHO, P_UNEVEN, PIECE = 0, 1, 7, 8, 9, 10
+# the segments of the batch, and 1 where a line force follows its robot
+P_L, P_K, P_TAU, P_RHO, P_UNEVEN, P_FOLLOWED, PIECE = 0, 1, 7, 8, 9, 10, 11
 # what is beyond a piece, about its end: force and moment; inertia's mass, first moment, and the moment by a
 # rotation (3, 3)
 B_F, B_M, B_MASS, B_FIRST, B_BACK, BEYOND = 0, 3, 6, 7, 10, 19

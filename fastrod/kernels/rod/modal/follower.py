@@ -1,9 +1,10 @@
-"""A force that follows the tip: no energy has it as its gradient.
+"""Forces that follow the rod, on the tip and along it: no energy has them as its gradient.
 
-In every iteration of Newton's method it acts as the force in the world that it is at the shape before; its
-rotation with the tip is a term of the Hessian that is not symmetric, J^T [F]x Theta with the tip's
-displacement J and rotation Theta by the unknowns. It has rank 3: the symmetric rest is solved, and the step
-corrected (Woodbury: Golub and Van Loan 2013, 2.1.4).
+In every iteration of Newton's method they act as the forces in the world that they are at the shape before;
+their rotation is a term of the Hessian that is not symmetric, J^T [F]x Theta with displacement J and rotation
+Theta by the unknowns. That of the tip has rank 3: the symmetric rest is solved, and the step corrected
+(Woodbury: Golub and Van Loan 2013, 2.1.4). That of a line force is left out, so its steps are shorter by a
+factor each, the load over that at which the rod would flutter, and not squared.
 """
 
 from __future__ import annotations
@@ -12,18 +13,31 @@ from ...jit import inline, kernel
 from ...vec import Vec, add, cross, dot, mul, scale, sub
 from ..lanes import W, get, get_mat, put, read, write
 from .cholesky import solve
-from .fields import N_POS, N_R, ModalWork, hessian
+from .fields import H_DEAD, H_FOLLOW, H_LINE, N_POS, N_R, P_FOLLOWED, ModalWork, hessian
 
 
 @kernel
-def follow_tip(work: ModalWork) -> bool:
-    """The force on the tip at the present shape; whether one of them follows it."""
+def follow(work: ModalWork) -> bool:
+    """The forces that follow the rod at the present shape; whether one of them is on a tip."""
     tip, some = work.node[-1, work.node.shape[1] - 1], False
     for w in range(W):
         force = get(work.outside, 12, w)
         some = some or dot(force, force) > 0.0
         put(work.outside, 0, w, add(get(work.outside, 9, w), mul(get_mat(tip, N_R, w), force)))
+    if work.piece[0, P_FOLLOWED * W] > 0.0:
+        follow_line(work)
     return some
+
+
+@kernel
+def follow_line(work: ModalWork) -> None:
+    """The line force at every node, in the world."""
+    for p in range(work.node.shape[0]):
+        for j in range(work.node.shape[1]):
+            node, history = work.node[p, j], work.history[p, j]
+            for w in range(W):
+                turned = mul(get_mat(node, N_R, w), get(history, H_FOLLOW, w))
+                put(history, H_LINE, w, add(get(history, H_DEAD, w), turned))
 
 
 @inline

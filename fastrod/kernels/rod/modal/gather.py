@@ -11,10 +11,13 @@ from ...vec import Vec, axpy, from_quaternion, scale, sub
 from ..gather import pick
 from ..lanes import Lanes, W, get, put, put_mat, write
 from .fields import (
+    H_DEAD,
+    H_FOLLOW,
     H_J,
     H_LINE,
     I_DK,
     I_STAR,
+    P_FOLLOWED,
     P_K,
     P_L,
     P_RHO,
@@ -200,6 +203,14 @@ def gather_loads(robots: Ints, ports: Ports, pieces: ModalPieces, b: ModalBasis,
             for j in range(b.node.shape[0]):
                 x = first + b.node[j] * (last - first)
                 put(work.history[p, j], H_LINE, w, _line_force(line, grids, x))
+            followed = len(ports.follower_line) > 0
+            write(work.piece[p], P_FOLLOWED, w, 1.0 if followed else 0.0)
+            if followed:
+                own_line = ports.follower_line[pick(i, len(ports.follower_line)), pieces.segment[p]]
+                for j in range(b.node.shape[0]):
+                    x, history = first + b.node[j] * (last - first), work.history[p, j]
+                    put(history, H_DEAD, w, get(history, H_LINE, w))
+                    put(history, H_FOLLOW, w, _line_force(own_line, grids, x))
 
 
 @kernel

@@ -29,12 +29,13 @@ from .fields import (
     L_SLACK,
     L_STEP,
     N_R,
+    P_FOLLOWED,
     P_K,
     P_L,
     ModalWork,
     hessian,
 )
-from .follower import correct_step, follow_tip
+from .follower import correct_step, follow
 from .modes import ModalBasis
 from .sweep import sweep_piece
 from .tendons import tendon_paths, tensions
@@ -162,9 +163,10 @@ def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> in
         energy -= dot(get(work.outside, 3, w), turned)
         sigma, size = read(newton, L_SIGMA, w), read(newton, L_SIZE, w)
         follower = get(work.outside, 12, w)
-        # the energy of a force that follows the tip is not the same after the step
+        # the energy of a force that follows the rod is not the same after the step
         small = size * read(newton, L_STEP, w) < 1e-6 or (sigma == 0.0 and size < tolerance)
-        small = small or (size < LONGEST_STEP and dot(follower, follower) > 0.0)
+        followed = dot(follower, follower) > 0.0 or read(work.piece[0], P_FOLLOWED, w) > 0.0
+        small = small or (size < LONGEST_STEP and followed)
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
         if read(newton, L_DONE, w) > 0.0:
             continue
@@ -204,12 +206,13 @@ def minimise(
     for i in range(most):
         sweep(b, first_tendon, command, work, True)
         note_slack(work)
-        follows = follow_tip(work)
+        on_tip = follow(work)
+        follows = on_tip or work.piece[0, P_FOLLOWED * W] > 0.0
         assemble(b, first_tendon, work)
         add_damping(b, work)
         factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 1) * W])
         solve(hessian(work), work.gradient)
-        if follows:
+        if on_tip:
             correct_step(work)
         small = measure_step(b, work, tolerance)
         if not small and (follows or not known):
