@@ -13,8 +13,8 @@ from truth import plant
 
 from fastrod.identification.attribution import _candidates, _needed, identify
 from fastrod.identification.excite import excitation
+from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.split import split, thinned
-from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report import report
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.result import Result
@@ -82,7 +82,7 @@ def test_the_headline_says_what_effects_do_in_millimetres() -> None:
 
 
 def test_errors_with_and_without_outliers_are_both_there() -> None:
-    """Ten held-out rows a centimetre off: the error without them is that of before, and a note has the other."""
+    """Ten held-out rows a centimetre off: the error without them is as before, and a note has the other."""
     log = sealed("gravity")
     tip = np.array(log.tip_position)
     held = np.flatnonzero(found("gravity").tested)

@@ -158,15 +158,30 @@ def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict
     assert made.kind == "drift"
 
 
-def test_the_share_that_is_gone_is_of_the_held_out_error() -> None:
-    assert "98 % of the held-out mean square" in found(0.0, left_out=0.02).summary
-    assert "100 % of the held-out mean square" in found(0.0, left_out=0.0).summary
-    assert "99 % of the held-out mean square" in found(0.01, left_out=float("nan")).summary
+def test_the_headline_is_millimetres_of_the_held_out_error() -> None:
+    made = grounds(
+        library=0.69e-3**2, after=0.69e-3**2, floor=0.69e-3**2, found=["backlash"], held_out=(11.6e-3, 0.8e-3)
+    )
+    assert made.summary == "Adding backlash cuts the held-out error from 11.6 to 0.80 mm (noise 0.69)."
+    without = found(0.01, left_out=float("nan")).summary
+    assert without.startswith("Adding backlash cuts the training error from ")
+
+
+@pytest.mark.parametrize(("at_floor", "verdict"), [(True, "explained"), (False, "partly_explained")])
+def test_explained_is_about_the_noise_and_not_about_the_error_before(at_floor: bool, verdict: str) -> None:
+    """1 % of a large error may be twice the noise, and a tenth of a small one within it."""
+    for left in (0.01, 0.1):
+        assert found(left, at_floor=at_floor).verdict == verdict
+    # a pattern that takes more than little is something, however near the noise the rest is
+    pattern = grounds(
+        library=0.7, after=0.6, steps=[took(None), took(JUMP)], found=["backlash"], at_floor=at_floor
+    )
+    assert pattern.verdict == "partly_explained"
 
 
 def test_several_effects_are_listed() -> None:
     made = grounds(library=FLOOR, after=FLOOR, found=["backlash", "creep", "gravity"])
-    assert "backlash, creep and gravity; with them" in made.summary
+    assert "Adding backlash, creep and gravity cuts" in made.summary
 
 
 def test_a_log_at_its_floor_divides_by_no_zero() -> None:

@@ -51,6 +51,13 @@ class Noise:
         """Distance rms that a perfect model would leave [m]."""
         return float(np.sqrt(np.sum(self.sigma**2)))
 
+    def below(self, error: float) -> Noise:
+        """Coloured noise no larger than the `error` [m] that a model leaves: rests bound slow noise but
+        loosely. White noise stays as it was read."""
+        if not self.model.order or not 0.0 < error < self.floor:
+            return self
+        return replace(self, sigma=self.sigma * (error / self.floor))
+
     def row_correlation(self, samples: LogSamples) -> Floats:
         """Autocorrelation of the noise from row to row of `samples`, of which rows may be left out, until it
         has faded; (1,) of white noise."""

@@ -30,7 +30,7 @@ def explained(result: Result) -> float:
     excess = result.test.before**2 - floor
     return (
         min(1.0, (result.test.before**2 - result.test.after**2) / excess)
-        if excess > 0.03 * floor
+        if excess > 0.03 * floor and result.knows_fractions
         else math.nan
     )
 
@@ -146,7 +146,9 @@ def _found(result: Result) -> str:
                 f'class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
                 for name, e in found.parameters.items()
             )
-            fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
+            fraction = "which share of the error it is, so short a log does not know"
+            if result.knows_fractions:
+                fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
             cards.append(
                 f'<div class="card effect"><h2>{escape(words(found.name))} <small>{fraction}</small></h2>'
                 f'<div class="soft">{escape(found.title)}</div><table>{rows}</table></div>'
@@ -165,7 +167,8 @@ def _found(result: Result) -> str:
         {"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind), ("of no known kind", "")
     )[0]
     return (
-        f'<h3>What is left</h3><div class="card">{percent(result.remaining_fraction)} of the error above '
+        f'<h3>What is left</h3><div class="card">'
+        f"{percent(result.remaining_fraction) if result.knows_fractions else 'A share'} of the error above "
         f"the noise: {kind}.</div>"
     )
 

@@ -11,7 +11,7 @@ FRACTIONS = {
     "static": ("follows from the present inputs", "#6d5bd0"),
     "memory": ("follows from the inputs before", "#2166c4"),
     "drift": ("slow in time", "#c2790a"),
-    "exogenous": ("a signal that no input explains", "#b4235a"),
+    "exogenous": ("not explained by this test", "#b4235a"),
 }
 
 

@@ -11,7 +11,8 @@ from fastrod.identification.report.result import Verdict
 from fastrod.identification.search.model_selection import SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
 
-_CLEAN = 0.06  # of the residual's variance: structure below it is none
+CLEAN = 0.06
+"""Of the residual's variance: structure below it is none."""
 # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
 _EXPLAINED, _PARTLY = 0.03, 0.45
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
@@ -46,11 +47,14 @@ def choose_verdict(
     structure: ResidualStructure,
     steps: Sequence[SearchStep],
     found: Sequence[str],
+    held_out: tuple[float, float] = (float("nan"), float("nan")),
+    at_floor: bool | None = None,
 ) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
     `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
-    above the noise that is left."""
+    above the noise that is left; `held_out`: that error before and after, rms [m]; `at_floor`: whether it is
+    the noise's, or what is left is white (without it: by the share that is left)."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative
@@ -70,7 +74,7 @@ def choose_verdict(
         else structure.kind
     )
     if not found and not alternatives:
-        if structure.structured <= _CLEAN:
+        if structure.structured <= CLEAN:
             return VerdictGrounds(
                 "none",
                 "The model explains this log down to its noise; nothing is missing that this log could show.",
@@ -90,20 +94,15 @@ def choose_verdict(
             patterns,
             False,
         )
-    spoken = [name.replace("_", " ") for name in found]
-    names = ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
-    if left <= _EXPLAINED:
+    done = left <= _EXPLAINED if at_floor is None else at_floor and foreign <= _EXPLAINED
+    if done:
         more = f" What little remains: {patterns[0]}." if patterns else ""
-        gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
-        it = "it" if len(found) == 1 else "them"
-        said = (
-            f"The model lacked {names}; with {it}, {_fraction(gone)} of the held-out mean square above the "
-            f"noise is gone.{more}"
-        )
+        said = f"{_cut(found, held_out, base, library, floor)}.{more}"
         return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, patterns, False)
+    what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
     if foreign > _FOREIGN or left > _PARTLY:
-        what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
+        names = _listed(found)
         certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
         quantity = "Most" if max(foreign, left) > 0.5 else "A good part"
@@ -115,19 +114,33 @@ def choose_verdict(
             patterns,
             not certain,
         )
-    what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
-    return VerdictGrounds(
-        "partly_explained",
-        f"The model lacked {names}, but {100 * left:.0f} % of the mean square above the noise remains{what}.",
-        kind,
-        left,
-        patterns,
-        False,
+    said = f"{_cut(found, held_out, base, library, floor)}{what}."
+    return VerdictGrounds("partly_explained", said, kind, left, patterns, False)
+
+
+def _listed(found: Sequence[str]) -> str:
+    spoken = [name.replace("_", " ") for name in found]
+    return ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
+
+
+def _cut(
+    found: Sequence[str], held_out: tuple[float, float], base: float, library: float, floor: float
+) -> str:
+    """What adding effects does to the error, in millimetres; to that of the training data where nothing was
+    held out."""
+    known = all(map(np.isfinite, held_out))
+    before, after = held_out if known else (float(np.sqrt(base)), float(np.sqrt(library)))
+    which = "held-out" if known else "training"
+    return (
+        f"Adding {_listed(found)} cuts the {which} error from {_mm(before)} to {_mm(after)} mm "
+        f"(noise {_mm(float(np.sqrt(floor)))})"
     )
 
 
-def _fraction(percent: float) -> str:
-    return "over 99 %" if 99.0 < percent < 100.0 else f"{percent:.0f} %"
+def _mm(metres: float) -> str:
+    """Two digits from a tenth on, three from ten on: 0.69, 11.6."""
+    number = 1e3 * metres
+    return f"{number:.3g}" if number >= 10.0 else f"{number:.2f}" if number >= 0.095 else f"{number:.2g}"
 
 
 def _words(kind: str) -> str:
@@ -135,6 +148,6 @@ def _words(kind: str) -> str:
         "static": "a function of the present inputs",
         "memory": "a function of the inputs before",
         "drift": "slow in time, whatever the inputs",
-        "unknown": "a signal that no input explains",
-        "none": "of no kind that the audit can tell",
+        "unknown": "not explained by this test",
+        "none": "of no kind that this test can tell",
     }[kind]

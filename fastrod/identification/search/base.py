@@ -96,11 +96,11 @@ def _search(samples: LogSamples, robot: Robot, excluded: frozenset[str], threads
     )
 
 
-def search_on(samples: LogSamples, base: BaseFit, sigma: Floats) -> Search:
-    """The search at other samples of the same robot, weighed by `sigma` (3,) [m]; outliers by the residual of
-    the base model."""
+def search_on(samples: LogSamples, base: BaseFit, sigma: Floats, state: ModelState) -> Search:
+    """The search at other samples of the same robot, weighed by `sigma` (3,) [m]; outliers by the residual
+    that `state` leaves: an abrupt effect is none once it is in the model."""
     search = _search(samples, base.robot, base.search.excluded, base.search.rod.threads)
-    pose = predict(base.start.model, base.start.theta, samples, search.rod)
+    pose = predict(state.model, state.theta, samples, search.rod)
     good = keep(samples, np.nan_to_num(search.target.tip - pose.position), base.noise) & pose.ok
     target = replace(search.target, weight=good.astype(float)).weighed(sigma, base.noise.sigma)
     correlation = base.noise.row_correlation(samples)

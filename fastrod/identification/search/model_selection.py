@@ -19,6 +19,9 @@ Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, b
 # or one that block after block confirms, where a smooth residual is worth few samples
 Z_BLOCKS, FRACTION_BLOCKS = 3.5, 0.03
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
+# of what the best leaves above the noise: friction and backlash on a log of another law of both left 0.777
+# and 0.775 mm of a noise of 0.69
+FRACTION_RIVAL = 0.05
 Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 
 

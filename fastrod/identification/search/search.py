@@ -27,6 +27,7 @@ from fastrod.identification.search.model_selection import (
     FRACTION_ACCEPT,
     FRACTION_BLOCKS,
     FRACTION_KEEP,
+    FRACTION_RIVAL,
     Z_ACCEPT,
     Z_BLOCKS,
     Z_KEEP,
@@ -442,7 +443,14 @@ class Search:
     def _rival(self, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
             return False
-        return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
+        if advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL:
+            return True
+        # both leave much more than the noise, and about as much: their forms are wrong by more than they differ
+        assert best.state is not None
+        losses = best.state.losses.sum(), other.state.losses.sum()
+        sigma = best.state.linearised.target.sigma
+        noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
+        return bool(losses[1] - losses[0] < FRACTION_RIVAL * (losses[0] - noise))
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""
@@ -546,7 +554,7 @@ class SearchOutcome:
     search: Search
     """With the weights of the last fit."""
     start: ModelState
-    """Without any of it, weighed as `search` does."""
+    """Without any of it, with its own weights."""
     last: ModelState
     """With alternative patterns."""
     state: ModelState
