@@ -14,9 +14,11 @@ from truth import plant
 from fastrod.identification.attribution import _candidates, _needed, identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.base_model import base_model
+from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.split import split, thinned
 from fastrod.identification.report import report
 from fastrod.identification.report.headline import explained
+from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.base import fit_base
 from fastrod.logs.runlog import RunLog
@@ -100,3 +102,28 @@ def test_a_short_log_claims_no_shares(seconds: float) -> None:
     result = replace(found("gravity"), log=log.rows(np.flatnonzero(log.t < seconds)))
     assert result.knows_fractions == (seconds > 10.0)
     assert math.isfinite(explained(result)) == (seconds > 10.0)
+
+
+@pytest.mark.parametrize("longer", [0.0, 0.05])
+def test_a_parameter_beyond_its_prior_is_the_first_thing_said(longer: float) -> None:
+    """Noise of 0.1 mm on the model's own tips, of a segment that is 5 % longer than a prior of 0.5 % says."""
+    robot = load_robot("prototype")
+    (segment,) = robot.segments
+    length = float(segment.length)
+    robot = replace(robot, fit={**robot.fit, "segment.1.length": {"sd": 0.005 * length}})
+    log = excitation(robot, seed=SEED, rate=RATE).log
+    log = replace(log, tip_position=np.zeros((len(log), 3)))
+    true = replace(robot, segments=(replace(segment, length=(1.0 + longer) * length),))
+    model, samples = base_model(true), sample(log)
+    tip = predict(model, model.start, samples, PredictedRod(samples, true, threads=1)).position
+    tip = tip + 1e-4 * np.random.default_rng(0).normal(size=tip.shape)
+    result = identify(replace(log, tip_position=tip), robot, threads=1)
+    e = result.base_parameters["segment.1.length"]
+    assert e.beyond_prior == (longer > 0.0)
+    assert_allclose(e.prior_mean, length)
+    made = report.to_json(result)["base_parameters"]["segment.1.length"]
+    assert made["prior_distance_sd"] == e.prior_distance
+    said = "Evidence of missing physics: length, segment 1 comes out at "
+    assert result.summary.startswith(said) == (longer > 0.0)
+    assert (" sd from its prior" in page(result)) == (longer > 0.0)
+    assert not (longer and "nothing is missing" in result.summary)

@@ -16,7 +16,7 @@ from fastrod.identification.log.noise import Noise, keep
 from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
-from fastrod.identification.report.verdict import CLEAN, VerdictGrounds, choose_verdict
+from fastrod.identification.report.verdict import AT_A_PRICE, CLEAN, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.search.base import SEEN, BaseFit, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -166,6 +166,9 @@ def assemble(
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept}
     ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
     say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
+    strain = strained(base_estimates)
+    said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
+    said += _sentences(limits(robot, samples)) if say_limits else []
     return Result(
         log=samples.log,
         robot=robot,
@@ -181,7 +184,7 @@ def assemble(
         train=train_error,
         test=test_error,
         verdict="ambiguous" if ambiguous else grounds.verdict,
-        summary=" ".join([grounds.summary, *(_sentences(limits(robot, samples)) if say_limits else [])]),
+        summary=" ".join([*strain, *said]),
         effects=effects,
         base_parameters=base_estimates | base.fixed,
         correlation=correlation,
@@ -280,6 +283,7 @@ def _classes(steps: Sequence[SearchStep], found: Sequence[str]) -> dict[str, lis
 
 def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
     scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((base.search.target.sigma**2).sum()))
+    alike = dict.fromkeys(step.rivals, "explains as much: this log cannot tell them apart") if kept else {}
     rejected = "another explains more" if kept else "not certain beside what this test does not explain"
     made = []
     for c in sorted(step.candidates, key=lambda c: (c.state is None, -c.bic_gain)):
@@ -293,7 +297,7 @@ def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
                 score=c.z,
                 bic_gain=c.bic_gain,
                 kept=c.name in kept,
-                why="kept" if c.name in kept else c.why or rejected,
+                why="kept" if c.name in kept else c.why or alike.get(c.name, rejected),
                 kind=c.alternative.kind if c.alternative else "effect",
             )
         )
@@ -305,10 +309,9 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     n = len(model.unknowns)
     C = covariance(fit)[:n, :n]
     stderr = np.sqrt(np.maximum(np.diag(C), 0.0)) if n else np.zeros(0)
-    _, sd = model.prior
     made = {}
-    for u, number, error, prior, at in zip(
-        model.unknowns, fit.theta[:n], stderr, sd, fit.at_bound, strict=False
+    for u, number, error, mean, prior, at in zip(
+        model.unknowns, fit.theta[:n], stderr, *model.prior, fit.at_bound, strict=False
     ):
         value = u.inside(float(number))
         seen = bool(error < SEEN * prior)
@@ -320,6 +323,8 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
             why="" if seen else "the data narrow its prior by less than a third",
             at_bound=at,
             prior_sd=float(prior * value if u.log else prior),
+            prior_mean=u.inside(float(mean)),
+            prior_distance=float((number - mean) / prior),
         )
     spread = np.where(stderr > 0.0, stderr, 1.0)
     return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))

@@ -238,6 +238,8 @@ def _estimates(every: Mapping[str, Estimate]) -> dict[str, Any]:
             "identifiable": e.identifiable,
             "why": e.why,
             "prior_sd": e.prior_sd,
+            "prior_mean": e.prior_mean,
+            "prior_distance_sd": e.prior_distance,
             "at_bound": e.at_bound,
         }
         for name, e in every.items()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fastrod.identification.report.result import Verdict
+from fastrod.identification.report.wording import amount, plain_name, with_error
 from fastrod.identification.search.model_selection import SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.solve import Estimate
 
 CLEAN = 0.06
 """Of the residual's variance: structure below it is none."""
@@ -20,6 +22,9 @@ _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what
 _FOREIGN = 0.3
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
+_MOST_STRAINED = 3  # parameters beyond their priors that the summary names
+AT_A_PRICE = "With that, the model explains this log down to its noise."
+"""The summary where nothing is found, but a parameter is beyond its prior."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +121,27 @@ def choose_verdict(
         )
     said = f"{_cut(found, held_out, base, library, floor)}{what}."
     return VerdictGrounds("partly_explained", said, kind, left, patterns, False)
+
+
+def strained(parameters: Mapping[str, Estimate]) -> list[str]:
+    """A sentence on the robot's own parameters that the data pull beyond their priors, the farthest first; no
+    sentence where there is none."""
+    far = sorted(
+        ((name, e) for name, e in parameters.items() if e.beyond_prior),
+        key=lambda pair: -abs(pair[1].prior_distance),
+    )
+    if not far:
+        return []
+    said = []
+    for name, e in far[:_MOST_STRAINED]:
+        # what is fitted as a logarithm has its sd as a share of its value
+        sd = e.prior_sd * e.prior_mean / e.value if e.unit == "x nominal" else e.prior_sd
+        prior, value = with_error(e.prior_mean, sd, e.unit), amount(e.value, e.unit, 3)
+        distance = f"{abs(e.prior_distance):.1f} sd from its prior of {prior}"
+        said.append(f"{plain_name(name)} comes out at {value}, {distance}")
+    more = len(far) - len(said)
+    rest = f"; and {more} more" if more else ""
+    return [f"Evidence of missing physics: {'; '.join(said)}{rest}."]
 
 
 def _listed(found: Sequence[str]) -> str:

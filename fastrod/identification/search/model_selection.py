@@ -121,6 +121,12 @@ def z_between(one: Candidate, other: Candidate) -> float:
     return paired(other.state.losses, one.state.losses)
 
 
+def equally_wrong(best: float, other: float, noise: float) -> bool:
+    """Whether of two held-out losses, the `best` and another one, both are so far above that of the `noise`
+    that they differ by less than their forms are wrong."""
+    return other - best < FRACTION_RIVAL * (best - noise)
+
+
 def unphysical(state: ModelState, name: str) -> str:
     """Why an effect's parameters cannot be, or nothing."""
     sizes = []

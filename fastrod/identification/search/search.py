@@ -27,7 +27,6 @@ from fastrod.identification.search.model_selection import (
     FRACTION_ACCEPT,
     FRACTION_BLOCKS,
     FRACTION_KEEP,
-    FRACTION_RIVAL,
     Z_ACCEPT,
     Z_BLOCKS,
     Z_KEEP,
@@ -39,6 +38,7 @@ from fastrod.identification.search.model_selection import (
     SearchStep,
     advantage,
     best_of,
+    equally_wrong,
     unphysical,
     z_between,
 )
@@ -445,12 +445,10 @@ class Search:
             return False
         if advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL:
             return True
-        # both leave much more than the noise, and about as much: their forms are wrong by more than they differ
         assert best.state is not None
-        losses = best.state.losses.sum(), other.state.losses.sum()
         sigma = best.state.linearised.target.sigma
         noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
-        return bool(losses[1] - losses[0] < FRACTION_RIVAL * (losses[0] - noise))
+        return equally_wrong(best.state.losses.sum(), other.state.losses.sum(), noise)
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""

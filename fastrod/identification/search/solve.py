@@ -18,6 +18,8 @@ Residual = Callable[[Floats], Floats]
 Slopes = Callable[[Floats, Floats], Floats]
 """theta (p,), residual there -> d(predicted)/d(theta) over sigma, (n, n_out, p)."""
 
+BEYOND = 3.0
+"""Standard deviations of its prior: a parameter beyond is evidence of what the model lacks."""
 _SMALL_STEP = 1e-3  # of a standard error: below it a fit has arrived
 
 
@@ -35,6 +37,15 @@ class Estimate:
     prior_sd: float = float("nan")
     """nan: none."""
     at_bound: bool = False
+    prior_mean: float = float("nan")
+    """nan: none, or not said."""
+    prior_distance: float = 0.0
+    """From the prior's mean, in its sd; of what is fitted as a logarithm, that of the logarithms."""
+
+    @property
+    def beyond_prior(self) -> bool:
+        """Whether the data pull it so far from its prior that something else must be wrong."""
+        return abs(self.prior_distance) > BEYOND
 
 
 @dataclass(frozen=True, eq=False)
