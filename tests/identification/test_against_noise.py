@@ -93,15 +93,19 @@ def test_errors_with_and_without_outliers_are_both_there() -> None:
     assert_allclose(result.test.after, found("gravity").test.after, rtol=0.05)
     assert result.test.all_rows > 1.5 * result.test.after
     assert any("outliers of what is left" in note for note in result.notes)
+    assert f"that jump; with them {1e3 * result.test.all_rows:.3g} mm held out" in page(result)
     assert not any("outliers of what is left" in note for note in found("gravity").notes)
 
 
 @pytest.mark.parametrize("seconds", [5.0, 60.0])
 def test_a_short_log_claims_no_shares(seconds: float) -> None:
     log = found("gravity").log
-    result = replace(found("gravity"), log=log.rows(np.flatnonzero(log.t < seconds)))
+    result = replace(found("gravity"), log=replace(log, t=log.t * seconds / np.ptp(log.t)))
     assert result.knows_fractions == (seconds > 10.0)
     assert math.isfinite(explained(result)) == (seconds > 10.0)
+    said = page(result)
+    assert ("The residual's variance" in said) == (seconds > 10.0)
+    assert ("too short to say which share" in said) == (seconds < 10.0)
 
 
 @pytest.mark.parametrize("longer", [0.0, 0.05])

@@ -198,9 +198,11 @@ def test_a_log_at_its_floor_divides_by_no_zero() -> None:
 def test_two_forms_that_are_as_wrong_are_rivals() -> None:
     """Friction and backlash left 0.777 and 0.775 mm of a noise of 0.69: 3 % of what is above it. At 0.80 mm
     one of them is the better form; at the noise any difference that blocks confirm is one."""
-    assert equally_wrong(0.775**2, 0.777**2, 0.69**2)
-    assert not equally_wrong(0.775**2, 0.800**2, 0.69**2)
-    assert not equally_wrong(0.690**2, 0.691**2, 0.69**2)
+    assert equally_wrong(11.6**2, 0.775**2, 0.777**2, 0.69**2)
+    assert not equally_wrong(11.6**2, 0.775**2, 0.800**2, 0.69**2)
+    assert not equally_wrong(11.6**2, 0.690**2, 0.691**2, 0.69**2)
+    # 3 mm are left: of two that take little away, one takes twice as much
+    assert not equally_wrong(3.10**2, 3.05**2, 3.075**2, 0.69**2)
 
 
 def test_parameters_beyond_their_priors_are_said_with_all_that_is_known() -> None:

@@ -133,6 +133,9 @@ def _bars(result: Result) -> str:
         f"┆ noise floor {millimetres(result.noise.floor)} mm, from {escape(result.noise.how)} · whisker: "
         "95 % interval"
     )
+    if (left_out := int(result.outlier.sum())) and math.isfinite(result.test.all_rows):
+        jumps = "row that jumps" if left_out == 1 else "rows that jump"
+        key += f" · without {left_out} {jumps}; with them {millimetres(result.test.all_rows)} mm held out"
     return f'<div class="bars">{"".join(made)}</div><p class="key">{key}</p>'
 
 
@@ -146,7 +149,7 @@ def _found(result: Result) -> str:
                 f'class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
                 for name, e in found.parameters.items()
             )
-            fraction = "which share of the error it is, so short a log does not know"
+            fraction = "this log is too short to say which share of the error it is"
             if result.knows_fractions:
                 fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
             cards.append(

@@ -189,7 +189,8 @@ def _remaining(result: Result, signals: Signals) -> str:
         blocks.append(f"<p>Outside the library, but found as a pattern:</p>{listed(result.patterns)}")
     fractions = [(key, getattr(structure, key), *FRACTIONS[key]) for key in FRACTIONS]
     known = sum(fraction for _, fraction, _, _ in fractions)
-    if (more := result.above_noise - known) > 0.0:
+    # what the held-out error has above the noise is no noise, even where this test finds nothing in it
+    if not result.patterns and (more := result.above_noise - known) > 0.0:
         fractions.append(("above the noise", more, "not explained by this test", "#8a5a44"))
     rest = max(0.0, 1.0 - sum(fraction for _, fraction, _, _ in fractions))
     bars = "".join(
@@ -202,8 +203,9 @@ def _remaining(result: Result, signals: Signals) -> str:
         for key, fraction, text, colour in fractions
     )
     taken_off = " once the pattern above is taken off" if result.patterns else ""
-    blocks.append(f"<h3>The residual's variance{taken_off}</h3>")
-    blocks.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
+    if result.knows_fractions:
+        blocks.append(f"<h3>The residual's variance{taken_off}</h3>")
+        blocks.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
     if len(signals.rows):
         caption = (
             "What is left of each axis, mean over stretches of time, and the band in which noise would "
@@ -220,7 +222,7 @@ def _remaining(result: Result, signals: Signals) -> str:
         )
     lead = f"{percent(result.remaining_fraction)} of the error above the noise remains unexplained."
     if not result.knows_fractions:
-        lead = "Which share of the error above the noise remains, so short a log does not know."
+        lead = "This log is too short to say which share of the error above the noise remains."
     elif result.remaining_fraction == 0.0 and result.above_noise > 0.0:
         lead = f"{percent(result.above_noise)} of the held-out mean square is above the noise."
     elif result.remaining_fraction == 0.0:

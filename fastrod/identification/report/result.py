@@ -19,7 +19,7 @@ from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
 SHORT = 10.0
-"""s; a log below it knows no shares: its held-out stretches are half a second each."""
+"""s; of a shorter log no shares are given: its held-out stretches are half a second each."""
 Verdict = Literal["none", "explained", "partly_explained", "ambiguous", "not_in_library"]
 
 

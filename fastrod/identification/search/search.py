@@ -427,7 +427,9 @@ class Search:
         ]
         # blocks that no fit has seen overrule the count of parameters
         best = max(sure, key=lambda c: c.fraction) if sure else best
-        rivals = [c for c in tried if c.alternative is None and c.name != best.name and self._rival(best, c)]
+        rivals = [
+            c for c in tried if c.alternative is None and c.name != best.name and self._rival(state, best, c)
+        ]
         fewer = best_of(
             [
                 c
@@ -440,7 +442,7 @@ class Search:
             best = fewer
         return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
-    def _rival(self, best: Candidate, other: Candidate) -> bool:
+    def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
             return False
         if advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL:
@@ -448,7 +450,8 @@ class Search:
         assert best.state is not None
         sigma = best.state.linearised.target.sigma
         noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
-        return equally_wrong(best.state.losses.sum(), other.state.losses.sum(), noise)
+        before, least, more = (float(s.losses.sum()) for s in (state, best.state, other.state))
+        return equally_wrong(before, least, more, noise)
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""
