@@ -7,6 +7,7 @@ import pytest
 from identification.logs import displacement_of, log_of, one_segment
 from numpy.testing import assert_allclose
 
+from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
 
@@ -98,6 +99,18 @@ def test_noise_without_rest_with_outliers(seed: int) -> None:
     found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
     assert (found.sigma > 0.9 * SIGMA).all()
     assert (found.sigma < 1.74 * 1.1 * SIGMA).all()
+
+
+def test_noise_alone_exceeds_its_limit_once_in_forty_times() -> None:
+    """Of 4000 means over 200 rows in three axes, 2.3 % are above (to 0.24 %); coloured rows are fewer."""
+    white = Noise(np.ones(3), 0.0, "given")
+    x = np.random.default_rng(0).normal(size=(4000, 200, 3))
+    above = np.mean(np.sqrt((x**2).sum(2).mean(1)) > white.most(200))
+    assert_allclose(above, 0.023, atol=0.01)
+    slow = Noise(np.ones(3), 0.9, "given", AutoRegression((0.9,)))
+    assert_allclose(slow.most(1900) - slow.floor, white.most(100) - white.floor, rtol=5e-3)
+    assert white.floor < white.most(10_000) < 1.01 * white.floor
+    assert Noise(np.ones(3), 0.0, "given", uncertainty=0.1).most(10_000) > 1.2 * white.floor
 
 
 def test_what_sways_at_rest_is_no_noise() -> None:

@@ -51,6 +51,12 @@ class Noise:
         """Distance rms that a perfect model would leave [m]."""
         return float(np.sqrt(np.sum(self.sigma**2)))
 
+    def most(self, n_rows: int) -> float:
+        """Distance rms [m] that noise alone exceeds on so many rows once in forty times: two standard errors,
+        of the floor and of a mean over as many independent rows as these are worth."""
+        rows = max(n_rows / self.model.length, 1.0)
+        return self.floor * (1.0 + 2.0 * float(np.hypot(self.uncertainty, 1.0 / np.sqrt(6.0 * rows))))
+
     def below(self, error: float) -> Noise:
         """Coloured noise no larger than the `error` [m] that a model leaves: rests bound slow noise but
         loosely. White noise stays as it was read."""

@@ -122,8 +122,8 @@ def _at_floor(noise: Noise, explained: Explained, remaining: ResidualStructure) 
     larger on data held out than on those that were fitted."""
     train, test = explained.train_error.after, explained.test_error
     after = test.after if math.isfinite(test.after) else train
-    floor = noise.floor * (1.0 + 2.0 * noise.uncertainty)
-    if after <= _NEAR * floor or test.interval[0] <= floor:
+    rows = explained.test if math.isfinite(test.after) else explained.used
+    if after <= max(_NEAR * noise.floor, noise.most(int(rows.sum()))):
         return True
     return remaining.structured <= CLEAN and after <= _NEAR * train
 

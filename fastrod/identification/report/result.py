@@ -138,10 +138,9 @@ class Result:
     @property
     def above_noise(self) -> float:
         """Share of the held-out mean square after that is above the noise; 0 where that is not sure."""
-        floor = self.noise.floor * (1.0 + 2.0 * self.noise.uncertainty)
-        if self.test.interval[0] <= floor:
+        if not self.test.after > self.noise.most(int(self.tested.sum())):
             return 0.0
-        return max(0.0, 1.0 - (self.noise.floor / self.test.after) ** 2) if self.test.after > 0.0 else 0.0
+        return 1.0 - (self.noise.floor / self.test.after) ** 2
 
     @property
     def knows_fractions(self) -> bool:
