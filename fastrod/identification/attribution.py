@@ -88,8 +88,16 @@ def identify(
     candidates = _candidates(base, max_effects, progressed)
     outcome = _needed(base, candidates, max_effects)
     progressed("prediction on all samples", most - 1, most)
-    remaining = residual_structure(some, model.wiring, outcome.last.fit.residual, noise_lag1=base.noise.lag1)
+    remaining = residual_structure(
+        some,
+        model.wiring,
+        outcome.last.fit.residual,
+        noise_lag1=base.noise.lag1,
+        correlation=base.search.row_correlation,
+        doubt=base.noise.uncertainty,
+    )
     explained = explain(log, base, outcome)
+    base = replace(base, noise=base.noise.below(explained.train_error.after))
     grounds = verdict_on(base, outcome, explained, remaining)
     result = assemble(log, base, outcome, explained, remaining, grounds)
     result = replace(result, notes=[*reading.questions, *result.notes])
@@ -180,12 +188,12 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
         f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes "
         "for each row; more effects may be missing"
     )
-    start = replace(base.start, linearised=base.start.linearised.under(search.target))
+    # with its own weights: bounds and squares of a residual under another's would be of no model
     return replace(
         all_found,
         search=search,
-        start=start,
-        state=alone if found else start,
+        start=base.start,
+        state=alone if found else base.start,
         names=tuple(found),
         steps=tuple(steps),
         notes=(stopped,) if search.spent else (),

@@ -7,6 +7,7 @@ import pytest
 from identification.logs import displacement_of, log_of, one_segment
 from numpy.testing import assert_allclose
 
+from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
 
@@ -100,13 +101,62 @@ def test_noise_without_rest_with_outliers(seed: int) -> None:
     assert (found.sigma < 1.74 * 1.1 * SIGMA).all()
 
 
+def test_noise_alone_exceeds_its_limit_once_in_forty_times() -> None:
+    """Of 4000 means over 200 rows in three axes, 2.3 % are above (to 0.24 %); coloured rows are fewer."""
+    white = Noise(np.ones(3), 0.0, "given")
+    x = np.random.default_rng(0).normal(size=(4000, 200, 3))
+    above = np.mean(np.sqrt((x**2).sum(2).mean(1)) > white.most(200))
+    assert_allclose(above, 0.023, atol=0.01)
+    slow = Noise(np.ones(3), 0.9, "given", AutoRegression((0.9,)))
+    assert_allclose(slow.most(1900) - slow.floor, white.most(100) - white.floor, rtol=5e-3)
+    assert white.floor < white.most(10_000) < 1.01 * white.floor
+    assert Noise(np.ones(3), 0.0, "given", uncertainty=0.1).most(10_000) > 1.2 * white.floor
+
+
 def test_what_sways_at_rest_is_no_noise() -> None:
-    """A line of half a hertz, three sigma: autocorrelated, so the noise is read from what is faster."""
+    """A line of half a hertz, three sigma, is told from broad noise and taken off."""
     t = np.arange(N)[:, None] / RATE
     found = read_noise(samples(), white(3) + 3.0 * SIGMA * np.sin(2.0 * np.pi * 0.5 * t), np.zeros((N, 3)))
-    assert found.lag1 > 0.6  # 4.5 / 5.5 of the variance, cos(2 pi 0.5 / 15) of it from one sample to the next
-    assert "fast" in found.how
-    assert_allclose(found.sigma, SIGMA, rtol=0.15)  # third differences of 690 samples: 6 %
+    assert_allclose(found.sway, 0.5, atol=0.005)
+    assert "less a line at 0.5 Hz" in found.how
+    assert found.model.order == 0
+    assert_allclose(found.sigma, SIGMA, rtol=0.1)
+
+
+def alike(rho: float, seed: int, n: int = N) -> np.ndarray:
+    """(n, 3) each sample `rho` times the one before plus news, of SIGMA in all."""
+    e = np.sqrt(1.0 - rho**2) * np.random.default_rng(seed).normal(size=(n, 3))
+    e[0] /= np.sqrt(1.0 - rho**2)
+    for i in range(1, n):
+        e[i] += rho * e[i - 1]
+    return SIGMA * e
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
+def test_coloured_noise_is_read_as_large_as_it_is(rho: float) -> None:
+    """Its variance is known from 690 (1 - rho^2) / (1 + rho^2) samples an axis, in the mean over six logs to
+    4 % at 0.95; one of (1 + rho) / (1 - rho) samples is independent."""
+    every = [read_noise(samples(), alike(rho, seed), np.zeros((N, 3))) for seed in range(6)]
+    assert_allclose(np.mean([n.floor for n in every]), np.linalg.norm(SIGMA), rtol=0.1)
+    length = (1.0 + rho) / (1.0 - rho)
+    assert_allclose(np.median([n.model.length for n in every]), length, rtol=0.35)
+    assert all("coloured" in n.how and not np.isfinite(n.sway) for n in every)
+    assert_allclose([n.lag1 for n in every], rho, atol=0.06)
+
+
+def test_rows_that_are_left_out_are_less_alike() -> None:
+    """Every third row: rho^3 from one to the next."""
+    found = read_noise(samples(), alike(0.8, 1), np.zeros((N, 3)))
+    thinned = samples().on(np.arange(0, N, 3))
+    assert_allclose(found.row_correlation(thinned)[1], found.lag1**3, rtol=0.02)
+    assert found.row_correlation(samples())[1] == found.lag1
+    white_one = read_noise(samples(), white(1), np.zeros((N, 3)))
+    assert len(white_one.row_correlation(samples())) == 1
+
+
+def test_a_robot_that_never_rests_hides_slow_noise_and_says_so() -> None:
+    found = read_noise(samples(rests=False), np.zeros((N, 3)), alike(0.9, 2))
+    assert "slow noise cannot be seen" in found.how
 
 
 def test_a_short_log_still_has_a_noise() -> None:

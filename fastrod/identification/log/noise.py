@@ -3,10 +3,12 @@ model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fastrod.identification.log.autoregression import AutoRegression, RestNoise, RestStretch, read_rest
 from fastrod.identification.log.forward import LogSamples
 from fastrod.types import Flags, Floats, Ints
 
@@ -16,8 +18,13 @@ _LEAST = 8  # samples of a stretch at rest
 ENOUGH = 30  # samples at rest from which a noise is believed
 _WINDOW = 7  # samples either side, of the Hampel filter
 _OUTLIER = 5.0  # sigma
-_MOVES = 0.3  # autocorrelation at rest beyond which more than noise is seen
+_LONG_SETTLE = 3.0  # s, where what is seen at rest is slow: creep and ringing are no noise
+_LONG_ENOUGH = 90  # samples that must be left then
 _TO_SIGMA = 1.4826  # of a median absolute deviation
+_KNOWN = 0.05  # a noise that rests tell to this is looked for nowhere else
+_WITHIN = 2.0  # standard errors of the noise at rest
+WHITE = AutoRegression()
+"""Samples that know nothing of each other."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +37,44 @@ class Noise:
     """Autocorrelation from one sample to the next."""
     how: str
     """What it was read from."""
+    model: AutoRegression = WHITE
+    """How samples know of each other."""
+    uncertainty: float = 0.0
+    """Relative standard error of `floor`; 0: not known."""
+    period: float = 1.0
+    """From one sample to the next [s]."""
+    sway: float = float("nan")
+    """A line in the spectrum at rest [Hz], which is no noise; nan: none."""
 
     @property
     def floor(self) -> float:
         """Distance rms that a perfect model would leave [m]."""
         return float(np.sqrt(np.sum(self.sigma**2)))
 
+    def most(self, n_rows: int) -> float:
+        """Distance rms [m] that noise alone exceeds on so many rows once in forty times: two standard errors,
+        of the floor and of a mean over as many independent rows as these are worth."""
+        rows = max(n_rows / self.model.length, 1.0)
+        return self.floor * (1.0 + 2.0 * float(np.hypot(self.uncertainty, 1.0 / np.sqrt(6.0 * rows))))
 
-def at_rest(samples: LogSamples) -> list[Ints]:
-    """Stretches of rows at which no input has moved for a while: arrays of indices into `samples.rows`."""
+    def below(self, error: float) -> Noise:
+        """Coloured noise no larger than the `error` [m] that a model leaves: rests bound slow noise but
+        loosely. White noise stays as it was read."""
+        if not self.model.order or not 0.0 < error < self.floor:
+            return self
+        return replace(self, sigma=self.sigma * (error / self.floor))
+
+    def row_correlation(self, samples: LogSamples) -> Floats:
+        """Autocorrelation of the noise from row to row of `samples`, of which rows may be left out, until it
+        has faded; (1,) of white noise."""
+        step = np.diff(samples.time[samples.rows])
+        step = step[step > 0.0]
+        return self.model.every(float(np.median(step)) / self.period if len(step) else 1.0)
+
+
+def at_rest(samples: LogSamples, settle: float = _SETTLE) -> list[Ints]:
+    """Stretches of rows at which no input has moved for `settle` [s]: arrays of indices into
+    `samples.rows`."""
     log = samples.log
     drives = [log.dl] + [
         a.reshape(len(log), -1)
@@ -52,7 +88,7 @@ def at_rest(samples: LogSamples) -> list[Ints]:
     # time since the last motion
     last = np.maximum.accumulate(np.where(moved, np.arange(len(moved)), 0))
     since = samples.time - samples.time[last]
-    quiet = (since >= _SETTLE)[samples.rows]
+    quiet = (since >= settle)[samples.rows]
     label = last[samples.rows]
     return [
         rows
@@ -65,41 +101,116 @@ def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a
     `residual` where the robot never rests."""
     pieces = at_rest(samples)
-    if sum(len(p) for p in pieces) >= ENOUGH:
-        flat = []
-        pairs = np.zeros(2)
-        weight = 0.0
-        for rows in pieces:
-            line = np.linspace(-1.0, 1.0, len(rows))[:, None]
-            middle = tip[rows] - np.median(tip[rows], axis=0)
-            for _ in range(2):  # the drift, of samples that are no outliers
-                near = np.abs(middle) <= 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0)
-                middle = middle - line * (near * line * middle).sum(0) / np.maximum(
-                    (near * line**2).sum(0), 1e-12
-                )
-            flat.append(middle * np.sqrt(len(rows) / (len(rows) - 2.0)))
-            inside = np.clip(
-                middle, *(side * 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0) for side in (-1.0, 1.0))
-            )
-            pairs += [(inside[1:] * inside[:-1]).sum(), (inside**2).sum()]
-            weight += len(rows)
-        every = np.concatenate(flat)
-        rough = _TO_SIGMA * np.median(np.abs(every), axis=0)
-        good = np.abs(every) <= 4.0 * rough + 1e-12
-        sigma = np.sqrt(np.array([np.mean(every[good[:, k], k] ** 2) for k in range(3)]))
-        lag1 = float(pairs[0] / max(pairs[1], 1e-30))
-        if lag1 > _MOVES:  # what moves at rest is no noise: a base that sways
-            return Noise(
-                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in pieces])),
-                lag1,
-                f"{len(every)} samples at rest, fast part",
-            )
-        return Noise(np.maximum(sigma, 1e-7), lag1, f"{len(every)} samples at rest")
+    if sum(len(p) for p in pieces) < ENOUGH:
+        return Noise(
+            _fast(np.diff(residual, n=3, axis=0)),
+            0.0,
+            "third differences of the residual; the robot never rests, so slow noise cannot be seen",
+        )
+    n = sum(len(p) for p in pieces)
+    period = _period(samples)
+    found = _read(samples, tip, pieces, period)
+    how = f"{n} samples at rest"
+    if found.model.order:
+        late = at_rest(samples, _LONG_SETTLE)
+        if sum(len(p) for p in late) >= _LONG_ENOUGH:
+            found = _read(samples, tip, late, period)
+            how = f"{sum(len(p) for p in late)} samples at rest"
+    sway = found.line / period
+    if np.isfinite(sway):
+        how += f", less a line at {sway:.3g} Hz"
+    if not found.model.order and not np.isfinite(sway):
+        sigma, lag1 = _white(tip, pieces)
+        return Noise(sigma, lag1, how, uncertainty=found.uncertainty, period=period)
+    lag1 = float(found.model.correlation(2)[1])
+    if found.model.order:
+        how += f", coloured: one of {found.model.length:.3g} is independent"
     return Noise(
-        _fast(np.diff(residual, n=3, axis=0)),
-        0.0,
-        "third differences of the residual; the robot never rests in this log",
+        np.maximum(found.sigma, 1e-7), lag1, how, found.model, found.uncertainty, period, float(sway)
     )
+
+
+def read_everywhere(samples: LogSamples, residual: Floats, noise: Noise) -> Noise:
+    """Coloured noise that rests are too short to know, from all of a `residual` (n_rows, 3) [m] where this is
+    no larger than the `noise` at rest may be; never more than what the residual is."""
+    if not noise.model.order:
+        return noise
+    size = np.sqrt(np.mean(residual[keep(samples, residual, noise)] ** 2, axis=0))
+    if noise.uncertainty > _KNOWN and np.sqrt((size**2).sum()) < noise.floor * (
+        1.0 + _WITHIN * noise.uncertainty
+    ):
+        cuts = np.flatnonzero(np.diff(samples.time[samples.rows]) > 1.5 * noise.period) + 1
+        ends = np.flatnonzero(np.diff(samples.time[samples.rows]) <= 0.0) + 1
+        pieces = np.split(np.arange(len(residual)), np.unique(np.concatenate([cuts, ends])))
+        found = _read(samples, residual, [p for p in pieces if len(p) >= _LEAST], noise.period, settled=True)
+        if found.model.order and found.uncertainty < noise.uncertainty:
+            lag1 = float(found.model.correlation(2)[1])
+            how = f"{noise.how}; the residual is as at rest everywhere, so all of it was read"
+            sigma = np.minimum(found.sigma, size)
+            return replace(
+                noise, sigma=sigma, lag1=lag1, how=how, model=found.model, uncertainty=found.uncertainty
+            )
+    return replace(noise, sigma=np.minimum(noise.sigma, size))
+
+
+def _period(samples: LogSamples) -> float:
+    """Time from one sample to the next [s]."""
+    steps = samples.dt[samples.dt > 0.0]
+    return float(np.median(steps)) if len(steps) else 1.0
+
+
+def _read(
+    samples: LogSamples, values: Floats, pieces: Sequence[Ints], period: float, *, settled: bool = False
+) -> RestNoise:
+    """The noise in these rows of `values` (n_rows, 3), outliers left out."""
+    first = {span.start for span in samples.runs}
+    stretches = []
+    for rows in pieces:
+        middle = values[rows] - np.median(values[rows], axis=0)
+        spread = _TO_SIGMA * np.median(np.abs(middle), axis=0)
+        rough = _fast(np.diff(values[rows], n=3, axis=0))
+        # what jumps beyond its neighbours, and beyond all that a slow noise does
+        near = np.abs(middle) <= 4.0 * np.maximum(spread, rough)
+        step = np.diff(middle, axis=0, prepend=middle[:1], append=middle[-1:])
+        lonely = (np.minimum(np.abs(step[1:]), np.abs(step[:-1])) > 6.0 * rough) & (
+            step[1:] * step[:-1] < 0.0
+        )
+        good = near.all(1) & ~lonely.any(1)
+        at = rows[good]
+        if len(at) < _LEAST:
+            continue
+        time = np.round(samples.time[samples.rows[at]] / period).astype(float)
+        # runs have clocks of their own; set them one after the other
+        run = int(np.searchsorted(sorted(first), samples.rows[at[0]], side="right"))
+        begun = samples.time[samples.rows[rows[0]]] < 1.5 * period + _LONG_SETTLE
+        time = time + run * 10 * len(samples.log)
+        stretches.append(RestStretch(time, values[at], moved=not settled and not begun))
+    return read_rest(stretches, 1.0 / period)
+
+
+def _white(tip: Floats, pieces: Sequence[Ints]) -> tuple[Floats, float]:
+    """(3,) sigma [m] of a tip (n_rows, 3) [m] at rest, a drift of each stretch taken off, and its
+    autocorrelation from one sample to the next; both robustly."""
+    flat = []
+    pairs = np.zeros(2)
+    for rows in pieces:
+        line = np.linspace(-1.0, 1.0, len(rows))[:, None]
+        middle = tip[rows] - np.median(tip[rows], axis=0)
+        for _ in range(2):  # the drift, of samples that are no outliers
+            near = np.abs(middle) <= 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0)
+            middle = middle - line * (near * line * middle).sum(0) / np.maximum(
+                (near * line**2).sum(0), 1e-12
+            )
+        flat.append(middle * np.sqrt(len(rows) / (len(rows) - 2.0)))
+        inside = np.clip(
+            middle, *(side * 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0) for side in (-1.0, 1.0))
+        )
+        pairs += [(inside[1:] * inside[:-1]).sum(), (inside**2).sum()]
+    every = np.concatenate(flat)
+    rough = _TO_SIGMA * np.median(np.abs(every), axis=0)
+    good = np.abs(every) <= 4.0 * rough + 1e-12
+    sigma = np.sqrt(np.array([np.mean(every[good[:, k], k] ** 2) for k in range(3)]))
+    return np.maximum(sigma, 1e-7), float(pairs[0] / max(pairs[1], 1e-30))
 
 
 def _fast(third: Floats) -> Floats:

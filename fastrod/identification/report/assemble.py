@@ -12,11 +12,11 @@ import numpy as np
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
-from fastrod.identification.log.noise import keep
+from fastrod.identification.log.noise import Noise, keep
 from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
-from fastrod.identification.report.verdict import VerdictGrounds, choose_verdict
+from fastrod.identification.report.verdict import AT_A_PRICE, CLEAN, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.search.base import SEEN, BaseFit, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -27,6 +27,8 @@ from fastrod.types import Flags, Floats
 
 ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
+_DIFFERS = 1.02  # of the error without outliers: with them it is said, too
+_NEAR = 1.1  # of the noise: a held-out error within it is explained
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 # of the error above the noise: where so much is left, shear and inertia are worth a sentence
@@ -65,22 +67,34 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     start = outcome.start
     if len(names) > 1:
         names = tuple(names[i] for i in np.argsort([-_own(state, name) for name in names]))
-    if len(rows) > len(search.samples.rows):
+    if len(rows) > len(search.samples.rows) or (names and _flags_moved(search, state, base)):
         piece = samples.on(rows)
-        search = search_on(piece, base, search.target.sigma)
+        search = search_on(piece, base, search.target.sigma, state)
         state = _nearer(state, search.again(state), piece, base)
         # with its own weights: what the base model does not explain must not push its parameters
-        again = search_on(piece, base, base.search.target.sigma).again(start)
+        again = search_on(piece, base, base.search.target.sigma, state).again(start)
         start = _nearer(start, again, piece, base)
     before = _everywhere(start, samples, base)
     after = _everywhere(state, samples, base) if names else before
     measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
-    residual = np.asarray(samples.log.tip_position) - before
+    residual = np.asarray(samples.log.tip_position) - after
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
     outlier[seen] = ~keep(samples.on(seen), residual[seen], base.noise)
     used, test = measured & ~log.tested & ~outlier, measured & log.tested & ~outlier
-    errors = (error_of(samples, before, after, which) for which in (used, test))
+    tested = measured & log.tested
+    length = base.noise.model.length
+    errors = (
+        error_of(samples, before, after, which, every, length)
+        for which, every in ((used, measured & ~log.tested), (test, tested))
+    )
     return Explained(search, start, state, names, outlier, used, test, before, after, *errors)
+
+
+def _flags_moved(search: Search, state: ModelState, base: BaseFit) -> bool:
+    """Whether other rows are outliers of what a state leaves than were of the base model's residual."""
+    pose = _predicted(state, search.samples, base)
+    good = keep(search.samples, np.nan_to_num(search.target.tip - pose.position), base.noise) & pose.ok
+    return bool((good != (search.target.weight > 0.0)).any())
 
 
 def verdict_on(
@@ -98,7 +112,20 @@ def verdict_on(
         structure=remaining,
         steps=outcome.steps,
         found=[_spoken(name, explained.state.model) for name in explained.names],
+        held_out=(error.before, error.after),
+        at_floor=_at_floor(base.noise, explained, remaining),
     )
+
+
+def _at_floor(noise: Noise, explained: Explained, remaining: ResidualStructure) -> bool:
+    """Whether the held-out error is the noise's, as well as both are known, or what is left is white and no
+    larger on data held out than on those that were fitted."""
+    train, test = explained.train_error.after, explained.test_error
+    after = test.after if math.isfinite(test.after) else train
+    rows = explained.test if math.isfinite(test.after) else explained.used
+    if after <= max(_NEAR * noise.floor, noise.most(int(rows.sum()))):
+        return True
+    return remaining.structured <= CLEAN and after <= _NEAR * train
 
 
 def assemble(
@@ -118,7 +145,12 @@ def assemble(
     if not kept:
         after = before
         train_error, test_error = (replace(e, after=e.before) for e in (train_error, test_error))
-        test_error = replace(test_error, interval=interval_of(samples, before, explained.test))
+        whole = _distance(samples, before, samples.log.measured & log.tested)
+        test_error = replace(
+            test_error,
+            interval=interval_of(samples, before, explained.test, noise.model.length),
+            all_rows=float(np.sqrt(whole.mean())) if len(whole) else float("nan"),
+        )
         path = path[:1]
     estimates, correlation = estimates_of(final.model, final.fit)
     classes = _classes(steps, kept)
@@ -134,6 +166,9 @@ def assemble(
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept}
     ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
     say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
+    strain = strained(base_estimates)
+    said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
+    said += _sentences(limits(robot, samples)) if say_limits else []
     return Result(
         log=samples.log,
         robot=robot,
@@ -149,7 +184,7 @@ def assemble(
         train=train_error,
         test=test_error,
         verdict="ambiguous" if ambiguous else grounds.verdict,
-        summary=" ".join([grounds.summary, *(_sentences(limits(robot, samples)) if say_limits else [])]),
+        summary=" ".join([*strain, *said]),
         effects=effects,
         base_parameters=base_estimates | base.fixed,
         correlation=correlation,
@@ -161,9 +196,19 @@ def assemble(
         path=path,
         bounds=explained.search.bounds(final),
         advice=advice.unique([*recommended, *lacks]),
-        notes=[*base.notes, *outcome.notes],
+        notes=[*base.notes, *outcome.notes, *_left_out(test_error)],
         solves=base.search.rod.runs,
     )
+
+
+def _left_out(error: Error) -> list[str]:
+    """What outliers do to the held-out error, where they do something."""
+    if not error.all_rows > _DIFFERS * error.after:
+        return []
+    return [
+        f"outliers of what is left do not count; with them the held-out error is "
+        f"{1e3 * error.all_rows:.3g} mm and not {1e3 * error.after:.3g}"
+    ]
 
 
 def _predicted(state: ModelState, piece: LogSamples, base: BaseFit) -> PredictedPose:
@@ -248,6 +293,8 @@ def _classes(steps: Sequence[SearchStep], found: Sequence[str]) -> dict[str, lis
 
 def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
     scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((base.search.target.sigma**2).sum()))
+    alike = dict.fromkeys(step.rivals, "explains as much: this log cannot tell them apart") if kept else {}
+    rejected = "another explains more" if kept else "not certain beside what this test does not explain"
     made = []
     for c in sorted(step.candidates, key=lambda c: (c.state is None, -c.bic_gain)):
         left = float("nan")
@@ -260,7 +307,7 @@ def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
                 score=c.z,
                 bic_gain=c.bic_gain,
                 kept=c.name in kept,
-                why="kept" if c.name in kept else c.why or "another explains more",
+                why="kept" if c.name in kept else c.why or alike.get(c.name, rejected),
                 kind=c.alternative.kind if c.alternative else "effect",
             )
         )
@@ -272,10 +319,9 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     n = len(model.unknowns)
     C = covariance(fit)[:n, :n]
     stderr = np.sqrt(np.maximum(np.diag(C), 0.0)) if n else np.zeros(0)
-    _, sd = model.prior
     made = {}
-    for u, number, error, prior, at in zip(
-        model.unknowns, fit.theta[:n], stderr, sd, fit.at_bound, strict=False
+    for u, number, error, mean, prior, at in zip(
+        model.unknowns, fit.theta[:n], stderr, *model.prior, fit.at_bound, strict=False
     ):
         value = u.inside(float(number))
         seen = bool(error < SEEN * prior)
@@ -287,6 +333,8 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
             why="" if seen else "the data narrow its prior by less than a third",
             at_bound=at,
             prior_sd=float(prior * value if u.log else prior),
+            prior_mean=u.inside(float(mean)),
+            prior_distance=float((number - mean) / prior),
         )
     spread = np.where(stderr > 0.0, stderr, 1.0)
     return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
@@ -307,20 +355,34 @@ def _distance(samples: LogSamples, predicted: Floats, which: Flags) -> Floats:
     return np.asarray(squares[np.isfinite(squares)])
 
 
-def error_of(samples: LogSamples, before: Floats, after: Floats, which: Flags) -> Error:
-    """Distance rms [m] at the samples of a mask, of tips (n, 3) predicted before and after."""
+def error_of(
+    samples: LogSamples,
+    before: Floats,
+    after: Floats,
+    which: Flags,
+    every: Flags | None = None,
+    length: float = 1.0,
+) -> Error:
+    """Distance rms [m] at the samples of a mask, of tips (n, 3) predicted before and after; the mask `every`
+    has those that were left out as outliers, too. One of `length` samples is independent."""
     if not which.any():
         return Error(before=float("nan"), after=float("nan"), interval=(float("nan"), float("nan")))
     values = [float(np.sqrt(_distance(samples, p, which).mean())) for p in (before, after)]
-    return Error(before=values[0], after=values[1], interval=interval_of(samples, after, which))
+    interval = interval_of(samples, after, which, length)
+    whole = values[1] if every is None else float(np.sqrt(_distance(samples, after, every).mean()))
+    return Error(before=values[0], after=values[1], interval=interval, all_rows=whole)
 
 
-def interval_of(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[float, float]:
-    """95 % interval of a distance rms, by resampling blocks of samples."""
+def interval_of(
+    samples: LogSamples, predicted: Floats, which: Flags, length: float = 1.0
+) -> tuple[float, float]:
+    """95 % interval of a distance rms, by resampling blocks of samples that are longer than the `length` of
+    which one is independent."""
     squares = _distance(samples, predicted, which)
     if len(squares) < 20:
         return float("nan"), float("nan")
-    means_of_blocks = [b.mean() for b in np.array_split(squares, min(20, len(squares) // 5))]
+    blocks = max(4, min(20, len(squares) // 5, int(len(squares) / (2.0 * length))))
+    means_of_blocks = [b.mean() for b in np.array_split(squares, blocks)]
     rng = np.random.default_rng(0)
     means = rng.choice(means_of_blocks, (2000, len(means_of_blocks))).mean(1)
     low, high = np.sqrt(np.quantile(means, [0.025, 0.975]))

@@ -30,7 +30,7 @@ def explained(result: Result) -> float:
     excess = result.test.before**2 - floor
     return (
         min(1.0, (result.test.before**2 - result.test.after**2) / excess)
-        if excess > 0.03 * floor
+        if excess > 0.03 * floor and result.knows_fractions
         else math.nan
     )
 
@@ -133,6 +133,9 @@ def _bars(result: Result) -> str:
         f"┆ noise floor {millimetres(result.noise.floor)} mm, from {escape(result.noise.how)} · whisker: "
         "95 % interval"
     )
+    if (left_out := int(result.outlier.sum())) and math.isfinite(result.test.all_rows):
+        jumps = "row that jumps" if left_out == 1 else "rows that jump"
+        key += f" · without {left_out} {jumps}; with them {millimetres(result.test.all_rows)} mm held out"
     return f'<div class="bars">{"".join(made)}</div><p class="key">{key}</p>'
 
 
@@ -146,7 +149,9 @@ def _found(result: Result) -> str:
                 f'class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
                 for name, e in found.parameters.items()
             )
-            fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
+            fraction = "this log is too short to say which share of the error it is"
+            if result.knows_fractions:
+                fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
             cards.append(
                 f'<div class="card effect"><h2>{escape(words(found.name))} <small>{fraction}</small></h2>'
                 f'<div class="soft">{escape(found.title)}</div><table>{rows}</table></div>'
@@ -165,7 +170,8 @@ def _found(result: Result) -> str:
         {"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind), ("of no known kind", "")
     )[0]
     return (
-        f'<h3>What is left</h3><div class="card">{percent(result.remaining_fraction)} of the error above '
+        f'<h3>What is left</h3><div class="card">'
+        f"{percent(result.remaining_fraction) if result.knows_fractions else 'A share'} of the error above "
         f"the noise: {kind}.</div>"
     )
 

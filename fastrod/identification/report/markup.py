@@ -11,7 +11,7 @@ FRACTIONS = {
     "static": ("follows from the present inputs", "#6d5bd0"),
     "memory": ("follows from the inputs before", "#2166c4"),
     "drift": ("slow in time", "#c2790a"),
-    "exogenous": ("a signal that no input explains", "#b4235a"),
+    "exogenous": ("not explained by this test", "#b4235a"),
 }
 
 
@@ -31,15 +31,17 @@ def listed(lines: Iterable[str]) -> str:
 
 
 def mark(e: Estimate, always: bool = False) -> str:
-    """HTML beside an estimate: at its bound, not identifiable and why, or what to note; only with `always`
-    also that it is identifiable."""
+    """HTML beside an estimate: at its bound, beyond its prior, not identifiable and why, or what to note;
+    only with `always` also that it is identifiable."""
     marks = []
     if e.at_bound:
         marks.append('<span class="chip">at bound</span>')
+    if e.beyond_prior:
+        marks.append(f'<span class="chip bad">{abs(e.prior_distance):.1f} sd from its prior</span>')
     if not e.identifiable:
         marks.append(f'<span class="chip bad">not identifiable</span> {escape(e.why)}')
     elif e.why:
         marks.append(escape(e.why))
-    elif always and not e.at_bound:
+    elif always and not e.at_bound and not e.beyond_prior:
         marks.append('<span class="chip good">identifiable</span>')
     return " ".join(marks)

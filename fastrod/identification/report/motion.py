@@ -10,7 +10,7 @@ from fastrod.identification.log.motion import LONGEST_STEP, MotionReplay
 from fastrod.identification.log.split import SplitLog
 from fastrod.identification.report.assemble import error_of, estimates_of, interval_of
 from fastrod.identification.report.result import Result, SearchStage
-from fastrod.identification.report.verdict import choose_verdict
+from fastrod.identification.report.verdict import choose_verdict, strained
 from fastrod.identification.search.motion import MotionFit, as_given
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.model.robot import Robot
@@ -75,7 +75,7 @@ def assemble_motion(log: SplitLog, robot: Robot, found: MotionFit, threads: int 
         train=train_error,
         test=test_error,
         verdict=grounds.verdict,
-        summary=summary,
+        summary=" ".join([*strained(estimates), summary]),
         effects=[],
         base_parameters=estimates | found.fixed,
         correlation=correlation,

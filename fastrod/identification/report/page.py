@@ -156,7 +156,10 @@ def _parameters(result: Result) -> str:
         caption = "Correlations of the fitted numbers. Near ±1: this log knows only their sum or difference."
         plain = [plain_name(name) for name in names]
         blocks.append(figure(figures.correlations(plain, matrix), caption))
-    lead = "Estimate and standard error; the prior that the fit began with; what this log says nothing about."
+    lead = (
+        "Estimate and standard error, samples that know of each other counted less; model form is not in it. "
+        "The prior that the fit began with; what this log says nothing about."
+    )
     return section("Parameters", lead, *blocks)
 
 
@@ -185,6 +188,10 @@ def _remaining(result: Result, signals: Signals) -> str:
     if result.patterns:
         blocks.append(f"<p>Outside the library, but found as a pattern:</p>{listed(result.patterns)}")
     fractions = [(key, getattr(structure, key), *FRACTIONS[key]) for key in FRACTIONS]
+    known = sum(fraction for _, fraction, _, _ in fractions)
+    # what the held-out error has above the noise is no noise, even where this test finds nothing in it
+    if not result.patterns and (more := result.above_noise - known) > 0.0:
+        fractions.append(("above the noise", more, "not explained by this test", "#8a5a44"))
     rest = max(0.0, 1.0 - sum(fraction for _, fraction, _, _ in fractions))
     bars = "".join(
         f'<div style="width:{100 * fraction:.2f}%;background:{colour}"></div>'
@@ -196,8 +203,9 @@ def _remaining(result: Result, signals: Signals) -> str:
         for key, fraction, text, colour in fractions
     )
     taken_off = " once the pattern above is taken off" if result.patterns else ""
-    blocks.append(f"<h3>The residual's variance{taken_off}</h3>")
-    blocks.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
+    if result.knows_fractions:
+        blocks.append(f"<h3>The residual's variance{taken_off}</h3>")
+        blocks.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
     if len(signals.rows):
         caption = (
             "What is left of each axis, mean over stretches of time, and the band in which noise would "
@@ -213,7 +221,11 @@ def _remaining(result: Result, signals: Signals) -> str:
             "it names nothing and is no part of <em>after</em>.</p>"
         )
     lead = f"{percent(result.remaining_fraction)} of the error above the noise remains unexplained."
-    if result.remaining_fraction == 0.0:
+    if not result.knows_fractions:
+        lead = "This log is too short to say which share of the error above the noise remains."
+    elif result.remaining_fraction == 0.0 and result.above_noise > 0.0:
+        lead = f"{percent(result.above_noise)} of the held-out mean square is above the noise."
+    elif result.remaining_fraction == 0.0:
         lead = "Nothing that held-out blocks confirm: what is left looks like noise."
     notes = f"<h3 style='margin-top:16px'>About this log</h3>{listed(result.notes)}" if result.notes else ""
     return section("What remains", lead, *blocks, notes)

@@ -41,10 +41,21 @@ def to_json(result: Result) -> dict[str, Any]:
         "n_samples": int(result.measured.sum()),
         "held_out": list(result.held_out),
         "noise_floor_m": result.noise.floor,
-        "noise": {"sigma_m": result.noise.sigma, "lag1": result.noise.lag1, "how": result.noise.how},
+        "noise": {
+            "sigma_m": result.noise.sigma,
+            "lag1": result.noise.lag1,
+            "how": result.noise.how,
+            "coefficients": list(result.noise.model.coefficients),
+            "uncertainty": result.noise.uncertainty,
+            "sway_hz": result.noise.sway,
+        },
         "error": {
             "train": _error(result.train),
-            "held_out": {**_error(result.test), "interval_m": list(result.test.interval)},
+            "held_out": {
+                **_error(result.test),
+                "interval_m": list(result.test.interval),
+                "all_rows_rms_m": result.test.all_rows,
+            },
         },
         "verdict": result.verdict,
         "summary": result.summary,
@@ -67,6 +78,7 @@ def to_json(result: Result) -> dict[str, Any]:
             "structured_fraction": result.remaining_fraction,
             "kind": result.remaining_kind,
             "patterns": list(result.patterns),
+            "above_noise": result.above_noise,
             "shares": {key: getattr(structure, key) for key in ("static", "memory", "drift", "exogenous")},
         },
         "patterns": list(result.patterns),
@@ -227,6 +239,8 @@ def _estimates(every: Mapping[str, Estimate]) -> dict[str, Any]:
             "identifiable": e.identifiable,
             "why": e.why,
             "prior_sd": e.prior_sd,
+            "prior_mean": e.prior_mean,
+            "prior_distance_sd": e.prior_distance,
             "at_bound": e.at_bound,
         }
         for name, e in every.items()

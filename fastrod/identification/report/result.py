@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,6 +18,8 @@ from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
+SHORT = 10.0
+"""s; of a shorter log no shares are given: its held-out stretches are half a second each."""
 Verdict = Literal["none", "explained", "partly_explained", "ambiguous", "not_in_library"]
 
 
@@ -61,6 +64,8 @@ class Error:
     after: float
     interval: tuple[float, float]
     """95 % interval of `after`, from blocks."""
+    all_rows: float = float("nan")
+    """`after` with the rows that were left out as outliers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,6 +136,18 @@ class Result:
     for."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
+
+    @property
+    def above_noise(self) -> float:
+        """Share of the held-out mean square after that is above the noise; 0 where that is not sure."""
+        if not self.test.after > self.noise.most(int(self.tested.sum())):
+            return 0.0
+        return 1.0 - (self.noise.floor / self.test.after) ** 2
+
+    @property
+    def knows_fractions(self) -> bool:
+        """Whether the log is long enough to say which fraction of an error is gone or left."""
+        return math.isfinite(self.test.interval[0]) and float(np.ptp(self.log.t)) >= SHORT
 
     @property
     def residual_before(self) -> Floats:

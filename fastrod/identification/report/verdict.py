@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fastrod.identification.report.result import Verdict
+from fastrod.identification.report.wording import amount, plain_name, with_error
 from fastrod.identification.search.model_selection import SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.solve import Estimate
 
-_CLEAN = 0.06  # of the residual's variance: structure below it is none
+CLEAN = 0.06
+"""Of the residual's variance: structure below it is none."""
 # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
 _EXPLAINED, _PARTLY = 0.03, 0.45
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
@@ -19,6 +22,9 @@ _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what
 _FOREIGN = 0.3
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
+_MOST_STRAINED = 3  # parameters beyond their priors that the summary names
+AT_A_PRICE = "With that, the model explains this log down to its noise."
+"""The summary where nothing is found, but a parameter is beyond its prior."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +52,14 @@ def choose_verdict(
     structure: ResidualStructure,
     steps: Sequence[SearchStep],
     found: Sequence[str],
+    held_out: tuple[float, float] = (float("nan"), float("nan")),
+    at_floor: bool | None = None,
 ) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
     `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
-    above the noise that is left."""
+    above the noise that is left; `held_out`: that error before and after, rms [m]; `at_floor`: whether it is
+    the noise's, or what is left is white (without it: by the share that is left)."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative
@@ -70,7 +79,7 @@ def choose_verdict(
         else structure.kind
     )
     if not found and not alternatives:
-        if structure.structured <= _CLEAN:
+        if structure.structured <= CLEAN:
             return VerdictGrounds(
                 "none",
                 "The model explains this log down to its noise; nothing is missing that this log could show.",
@@ -90,20 +99,15 @@ def choose_verdict(
             patterns,
             False,
         )
-    spoken = [name.replace("_", " ") for name in found]
-    names = ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
-    if left <= _EXPLAINED:
+    done = left <= _EXPLAINED if at_floor is None else at_floor and foreign <= _EXPLAINED
+    if done:
         more = f" What little remains: {patterns[0]}." if patterns else ""
-        gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
-        it = "it" if len(found) == 1 else "them"
-        said = (
-            f"The model lacked {names}; with {it}, {_fraction(gone)} of the held-out mean square above the "
-            f"noise is gone.{more}"
-        )
+        said = f"{_cut(found, held_out, base, library, floor)}.{more}"
         return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, patterns, False)
+    what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
     if foreign > _FOREIGN or left > _PARTLY:
-        what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
+        names = _listed(found)
         certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
         quantity = "Most" if max(foreign, left) > 0.5 else "A good part"
@@ -115,19 +119,54 @@ def choose_verdict(
             patterns,
             not certain,
         )
-    what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
-    return VerdictGrounds(
-        "partly_explained",
-        f"The model lacked {names}, but {100 * left:.0f} % of the mean square above the noise remains{what}.",
-        kind,
-        left,
-        patterns,
-        False,
+    said = f"{_cut(found, held_out, base, library, floor)}{what}."
+    return VerdictGrounds("partly_explained", said, kind, left, patterns, False)
+
+
+def strained(parameters: Mapping[str, Estimate]) -> list[str]:
+    """A sentence on the robot's own parameters that the data pull beyond their priors, the farthest first; no
+    sentence where there is none."""
+    far = sorted(
+        ((name, e) for name, e in parameters.items() if e.beyond_prior),
+        key=lambda pair: -abs(pair[1].prior_distance),
+    )
+    if not far:
+        return []
+    said = []
+    for name, e in far[:_MOST_STRAINED]:
+        # what is fitted as a logarithm has its sd as a share of its value
+        sd = e.prior_sd * e.prior_mean / e.value if e.unit == "x nominal" else e.prior_sd
+        prior, value = with_error(e.prior_mean, sd, e.unit), amount(e.value, e.unit, 3)
+        distance = f"{abs(e.prior_distance):.1f} sd from its prior of {prior}"
+        said.append(f"{plain_name(name)} comes out at {value}, {distance}")
+    more = len(far) - len(said)
+    rest = f"; and {more} more" if more else ""
+    return [f"Evidence of missing physics: {'; '.join(said)}{rest}."]
+
+
+def _listed(found: Sequence[str]) -> str:
+    spoken = [name.replace("_", " ") for name in found]
+    return ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
+
+
+def _cut(
+    found: Sequence[str], held_out: tuple[float, float], base: float, library: float, floor: float
+) -> str:
+    """What adding effects does to the error, in millimetres; to that of the training data where nothing was
+    held out."""
+    known = all(map(np.isfinite, held_out))
+    before, after = held_out if known else (float(np.sqrt(base)), float(np.sqrt(library)))
+    which = "held-out" if known else "training"
+    return (
+        f"Adding {_listed(found)} cuts the {which} error from {_mm(before)} to {_mm(after)} mm "
+        f"(noise {_mm(float(np.sqrt(floor)))})"
     )
 
 
-def _fraction(percent: float) -> str:
-    return "over 99 %" if 99.0 < percent < 100.0 else f"{percent:.0f} %"
+def _mm(metres: float) -> str:
+    """Two digits from a tenth on, three from ten on: 0.69, 11.6."""
+    number = 1e3 * metres
+    return f"{number:.3g}" if number >= 10.0 else f"{number:.2f}" if number >= 0.095 else f"{number:.2g}"
 
 
 def _words(kind: str) -> str:
@@ -135,6 +174,6 @@ def _words(kind: str) -> str:
         "static": "a function of the present inputs",
         "memory": "a function of the inputs before",
         "drift": "slow in time, whatever the inputs",
-        "unknown": "a signal that no input explains",
-        "none": "of no kind that the audit can tell",
+        "unknown": "not explained by this test",
+        "none": "of no kind that this test can tell",
     }[kind]

@@ -21,6 +21,7 @@ _LONG = 20.0  # s, of a run in which something can happen
 _TIMES = 48  # change points tried
 _ROWS_AROUND = 400  # the best of them, where a time between two rows is sought
 _FREQUENCIES = (0.08, 3.0)  # Hz, of a line
+_PERIODS = 2.0  # that a log must hold of what is called periodic
 _NARROW = 4.0  # lines tried per 1 / duration
 
 
@@ -167,7 +168,8 @@ def _sway(linearised: LinearisedModel, residual: Floats) -> Iterator[Alternative
         return
     step = float(np.median(np.diff(t)))
     top = min(_FREQUENCIES[1], 0.45 / max(step, 1e-9))
-    frequencies = np.arange(_FREQUENCIES[0], top, 1.0 / (_NARROW * duration))
+    longest = max(float(np.ptp(linearised.samples.time[span])) for span in linearised.samples.runs)
+    frequencies = np.arange(max(_FREQUENCIES[0], _PERIODS / longest), top, 1.0 / (_NARROW * duration))
     if not len(frequencies):
         return
     wave = np.exp(-2j * np.pi * frequencies[:, None] * t[None])
@@ -203,13 +205,15 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
             angle = 2.0 * np.pi * dl[:, int(np.flatnonzero(wiring.drive == drive)[0])] / wavelength
             response = linearised.by_length @ pull
             blocks += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
-        yield AlternativePattern(
+        periods = span / wavelength
+        name, what = (
             "ripple",
-            "static",
             f"periodic in the tendons with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
-            _weighted(linearised, np.stack(blocks, axis=-1)),
-            1,
         )
+        if periods < _PERIODS:  # as many other laws look
+            name = "wave"
+            what = f"a wave over {periods:.2g} of whose periods the tendons move: too few to name a cause"
+        yield AlternativePattern(name, "static", what, _weighted(linearised, np.stack(blocks, axis=-1)), 1)
 
 
 def _contact(linearised: LinearisedModel) -> Iterator[AlternativePattern]:

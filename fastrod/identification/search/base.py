@@ -10,13 +10,13 @@ import numpy as np
 from fastrod.errors import LogError
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
-from fastrod.identification.log.noise import ENOUGH, Noise, at_rest, keep, read_noise
+from fastrod.identification.log.noise import ENOUGH, Noise, at_rest, keep, read_everywhere, read_noise
 from fastrod.identification.log.questions import further_than_still
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, target_of
 from fastrod.identification.search.model_selection import ModelState
 from fastrod.identification.search.search import N_BLOCKS, Search
-from fastrod.identification.search.solve import Estimate, rms
+from fastrod.identification.search.solve import Estimate, covariance_of, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
 
@@ -60,17 +60,25 @@ def fit_base(
     given = robot.sensor.get("noise", 0.0)
     declared = float(max(given) if isinstance(given, tuple) else given)
     if declared > 0.0:
-        noise = Noise(np.full(3, declared), noise.lag1, "the robot file's [sensor] noise")
+        noise = replace(
+            noise, sigma=np.full(3, declared), how="the robot file's [sensor] noise", uncertainty=0.0
+        )
     good = keep(samples, np.nan_to_num(raw), noise) & linearised.pose.ok
     out = int((~good).sum())
     if out > 0.005 * len(raw):
         notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
     target = replace(target, weight=good.astype(float)).weighed(noise.sigma, noise.sigma)
-    fixed = _unseen(linearised.under(target))
+    fixed = _unseen(linearised.under(target), noise.row_correlation(samples))
     model = replace(model, unknowns=tuple(u for u in model.unknowns if u.name not in fixed))
     size = max(1.0, rms(target.residual(linearised.pose)))
     search = replace(search, target=target.weighed(noise.sigma * size, noise.sigma))
     state = search.start(model, model.start)
+    if noise.model.order and not declared > 0.0:
+        every = samples.on(rows[:_FOR_NOISE])
+        pose = predict(state.model, state.theta, every, PredictedRod(every, robot, threads=threads))
+        left = np.asarray(every.log.tip_position)[every.rows] - pose.position
+        noise = read_everywhere(every.on(every.rows[pose.ok]), left[pose.ok], noise)
+    search = replace(search, noise=noise.sigma, row_correlation=noise.row_correlation(samples))
     for _ in range(2):
         search, state = search.weighed(state, noise.sigma)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=tuple(notes))
@@ -88,14 +96,15 @@ def _search(samples: LogSamples, robot: Robot, excluded: frozenset[str], threads
     )
 
 
-def search_on(samples: LogSamples, base: BaseFit, sigma: Floats) -> Search:
-    """The search at other samples of the same robot, weighed by `sigma` (3,) [m]; outliers by the residual of
-    the base model."""
+def search_on(samples: LogSamples, base: BaseFit, sigma: Floats, state: ModelState) -> Search:
+    """The search at other samples of the same robot, weighed by `sigma` (3,) [m]; outliers by the residual
+    that `state` leaves: an abrupt effect is none once it is in the model."""
     search = _search(samples, base.robot, base.search.excluded, base.search.rod.threads)
-    pose = predict(base.start.model, base.start.theta, samples, search.rod)
+    pose = predict(state.model, state.theta, samples, search.rod)
     good = keep(samples, np.nan_to_num(search.target.tip - pose.position), base.noise) & pose.ok
     target = replace(search.target, weight=good.astype(float)).weighed(sigma, base.noise.sigma)
-    return replace(search, target=target)
+    correlation = base.noise.row_correlation(samples)
+    return replace(search, target=target, noise=base.noise.sigma, row_correlation=correlation)
 
 
 def _noise(every: LogSamples, model: Model, robot: Robot, threads: int | None) -> Noise:
@@ -107,18 +116,17 @@ def _noise(every: LogSamples, model: Model, robot: Robot, threads: int | None) -
     return read_noise(every, tip, np.nan_to_num(tip - pose.position))
 
 
-def _unseen(linearised: LinearisedModel) -> dict[str, Estimate]:
+def _unseen(linearised: LinearisedModel, correlation: Floats) -> dict[str, Estimate]:
     """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free.
     And stiffnesses that nobody put into `[fit]`, where no load is known: what the tendons' stretch would show
     of them, any gain of the drives shows as well."""
     model, samples = linearised.model, linearised.samples
     r = linearised.residual(model, model.start)
     J = linearised.slopes(model, model.start, r)
-    flat = J.reshape(r.size, J.shape[-1])
     _, sd = model.prior
-    H = flat.T @ flat + np.diag(1.0 / sd**2)
     fixed, requested = {}, set(model.robot.fit)
-    posterior = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H)), 0.0)) if len(sd) else sd
+    spread = covariance_of(J, 1.0 / sd**2, correlation) if len(sd) else np.zeros((0, 0))
+    posterior = np.sqrt(np.maximum(np.diag(spread), 0.0))
     for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
         blind = (
             "stiffness" in u.name

@@ -19,6 +19,11 @@ Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, b
 # or one that block after block confirms, where a smooth residual is worth few samples
 Z_BLOCKS, FRACTION_BLOCKS = 3.5, 0.03
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
+# of what the best leaves above the noise: friction and backlash on a log of another law of both left 0.777
+# and 0.775 mm of a noise of 0.69
+FRACTION_RIVAL = 0.05
+# of what the best takes away: beside much that is left, all that take a little away would be alike
+FRACTION_GAIN = 0.2
 Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 
 
@@ -116,6 +121,12 @@ def z_between(one: Candidate, other: Candidate) -> float:
     assert one.state is not None
     assert other.state is not None
     return paired(other.state.losses, one.state.losses)
+
+
+def equally_wrong(before: float, best: float, other: float, noise: float) -> bool:
+    """Whether of two held-out losses, the `best` and another one, both are so far above that of the `noise`
+    that they differ by less than their forms are wrong; and both take about as much off the loss `before`."""
+    return other - best < min(FRACTION_RIVAL * (best - noise), FRACTION_GAIN * (before - best))
 
 
 def unphysical(state: ModelState, name: str) -> str:

@@ -8,11 +8,13 @@ signal from outside.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.search.correlation import draws, length
 from fastrod.identification.search.solve import paired
 from fastrod.model.routing import Routing
 from fastrod.types import Floats, Ints
@@ -22,6 +24,7 @@ _PLAYS = (0.03, 0.1, 0.25, 0.5)  # of the largest bend
 _LAGS = (0.3, 1.5, 6.0, 25.0)  # s
 _PIECES = 60  # blocks that the folds take in turn
 _RIDGES = (1.0, 30.0, 1000.0)
+_DRAWS = 30  # of noise that is alike from row to row
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,21 @@ class ResidualStructure:
 
 
 def residual_structure(
-    samples: LogSamples, wiring: Routing, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10
+    samples: LogSamples,
+    wiring: Routing,
+    residual: Floats,
+    noise_lag1: float = 0.0,
+    n_blocks: int = 10,
+    *,
+    correlation: Floats | None = None,
+    doubt: float = 0.0,
 ) -> ResidualStructure:
-    """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
+    """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks. The noise is
+    alike from row to row by `noise_lag1`, or by all of a `correlation` (k,) that fades: then a share counts
+    by what it has beyond that of simulated noise. `doubt`: relative standard error of the noise."""
+    alike = np.ones(1) if correlation is None else correlation
+    if coloured := len(alike) > 1:
+        noise_lag1 = float(alike[1])
     variance = float((residual**2).sum())
     block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
     if variance <= 0.0 or n_blocks < 3:
@@ -69,12 +84,15 @@ def residual_structure(
     columns = np.zeros((len(residual), 0))
     left = residual
     fractions = []
+    null = _Null(alike, residual.shape[1], block, n_blocks) if coloured else None
     for more in (static, memory, drift):
         columns = np.concatenate([columns, more], axis=1)
         loss, rest = _ridge(columns, residual, block, n_blocks)
         gain = losses[-1] - loss
-        if gain.sum() > 0.0 and paired(losses[-1], loss) > 2.5:
-            fractions.append(float(gain.sum()) / variance)
+        by_noise = null.gain(columns) if null else 0.0
+        fraction = float(gain.sum()) / variance - by_noise
+        if fraction > 0.0 and paired(losses[-1], loss) > 2.5:
+            fractions.append(fraction)
             losses.append(loss)
             left = rest
         else:
@@ -84,24 +102,50 @@ def residual_structure(
     )
     pair = float((left[1:] * left[:-1])[order].sum()) / max(float((left**2).sum()), 1e-300)
     beyond = max(0.0, pair - max(noise_lag1, 0.0)) if len(left) > 50 else 0.0
-    exogenous = (
-        beyond * float((left**2).sum()) / variance
-        if beyond > 4.0 / np.sqrt(max(left.size, 1)) + 0.02
-        else 0.0
-    )
+    unsure = 4.0 / np.sqrt(max(left.size, 1)) + 0.02
+    if coloured:  # the noise's own autocorrelation is known from rests only
+        unsure += 3.0 * doubt * float(np.sqrt(2.0 * (1.0 - noise_lag1**2) / length(alike)))
+    exogenous = beyond * float((left**2).sum()) / variance if beyond > unsure else 0.0
     z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
     return ResidualStructure(
         fractions[0], fractions[1], fractions[2], exogenous, float(max(z, beyond * np.sqrt(left.size)))
     )
 
 
-def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tuple[Floats, Floats]:
+class _Null:
+    """What general features find in noise that is alike from row to row: slow noise follows slow features
+    from one block to the next."""
+
+    def __init__(self, correlation: Floats, n_out: int, block: Ints, n_blocks: int) -> None:
+        drawn = draws(correlation, len(block), n_out * _DRAWS)
+        self._noise, self._n_out = drawn, n_out
+        self._block, self._n_blocks = block, n_blocks
+        self._left = self._by_draw((drawn**2).sum(0))
+        self._power = self._left.copy()
+
+    def _by_draw(self, squares: Floats) -> Floats:
+        return np.asarray(squares.reshape(_DRAWS, self._n_out).sum(1))
+
+    def gain(self, features: Floats) -> float:
+        """Share of the variance that `features` take away beyond those asked for before, at most but for a
+        rare draw."""
+        left = np.full(_DRAWS, np.inf)
+        for ridge in _RIDGES:
+            _, rest = _ridge(features, self._noise, self._block, self._n_blocks, (ridge,))
+            left = np.minimum(left, self._by_draw((rest**2).sum(0)))
+        gain, self._left = (self._left - left) / self._power, left
+        return max(0.0, float(gain.mean() + 3.0 * gain.std()))
+
+
+def _ridge(
+    features: Floats, residual: Floats, block: Ints, n_blocks: int, ridges: Sequence[float] = _RIDGES
+) -> tuple[Floats, Floats]:
     """Held-out loss of each block, and the held-out rest, at the best of a few ridges."""
     X = np.column_stack([np.ones(len(features)), features])
     gram, moment = X.T @ X, X.T @ residual
     own = [(X[block == k], residual[block == k]) for k in range(n_blocks)]
     best: tuple[float, Floats, Floats] | None = None
-    for ridge in _RIDGES:
+    for ridge in ridges:
         losses, rest = np.zeros(n_blocks), residual.copy()
         for k, (x, r) in enumerate(own):
             if not len(x):

@@ -17,6 +17,7 @@ from fastrod.effects.base import effect_names, get_effect, trait
 from fastrod.identification.log.forward import LogSamples, PredictedRod
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
+from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
 from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
     BIC_ACCEPT,
@@ -37,6 +38,7 @@ from fastrod.identification.search.model_selection import (
     SearchStep,
     advantage,
     best_of,
+    equally_wrong,
     unphysical,
     z_between,
 )
@@ -75,6 +77,10 @@ class Search:
     block: Ints
     """(n,) number of each row's block, 0 to N_BLOCKS - 1; one block at a time is held out."""
     excluded: frozenset[str] = frozenset()
+    noise: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    """(3,) of the tip [m]."""
+    row_correlation: Floats = field(default_factory=lambda: np.ones(1))
+    """(k,) autocorrelation of the noise from row to row, until it has faded; (1,) of white noise."""
     report: Callable[[str], None] = field(default=lambda _: None)
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
@@ -290,9 +296,11 @@ class Search:
     ) -> Candidate:
         """A candidate's evidence against the state without it."""
         k = len(with_it.fit.theta) - len(state.fit.theta) + (alternative.n_hidden if alternative else 0)
-        size = effective_size(with_it.fit.residual)
+        size = self._worth(with_it)
         gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
-        z = paired(state.losses, with_it.losses)
+        z = paired(state.losses, with_it.losses) / blocks_alike(
+            self.row_correlation, len(self.block) // N_BLOCKS
+        )
         fraction = 1.0 - with_it.fit.loss / state.fit.loss
         why = "" if alternative else unphysical(with_it, name)
         evident = (
@@ -300,11 +308,29 @@ class Search:
             or (z > Z_STRONG and gain > BIC_STRONG)
             or (z > Z_BLOCKS and fraction > FRACTION_BLOCKS)
         )
+        evident = evident and self._beyond_noise(state, with_it) > k * np.log(size) + BIC_ACCEPT
         if not why and not (fraction > FRACTION_ACCEPT and evident):
             why = (
                 f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * fraction:.1f} % of the loss)"
             )
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
+
+    def _worth(self, state: ModelState) -> float:
+        """Samples that a state's residual is worth, of which coloured noise leaves fewer."""
+        residual = state.fit.residual
+        return min(effective_size(residual), max(residual.size / length(self.row_correlation), 4.0))
+
+    def _beyond_noise(self, state: ModelState, with_it: ModelState) -> float:
+        """-2 log likelihood that is gained against coloured noise, along the change that the candidate makes:
+        slow noise is large along slow changes. Infinite where the noise is white: there the residual says as
+        much."""
+        if len(self.row_correlation) < 2:
+            return np.inf
+        change = state.fit.residual - with_it.fit.residual
+        size = float(np.mean((with_it.linearised.target.sigma / self.noise) ** 2))
+        left = with_it.fit.loss / max(with_it.fit.residual.size, 1)
+        gain = (state.fit.loss - with_it.fit.loss) * min(size, 1.0 / max(left, 1e-12))
+        return gain / spread(change[..., None], self.row_correlation)
 
     def alternative_candidates(self, state: ModelState) -> list[Candidate]:
         """The best alternative pattern of each family beside a state, linear in everything."""
@@ -437,7 +463,9 @@ class Search:
         ]
         # blocks that no fit has seen overrule the count of parameters
         best = max(sure, key=lambda c: c.fraction) if sure else best
-        rivals = [c for c in tried if c.alternative is None and c.name != best.name and self._rival(best, c)]
+        rivals = [
+            c for c in tried if c.alternative is None and c.name != best.name and self._rival(state, best, c)
+        ]
         fewer = best_of(
             [
                 c
@@ -450,10 +478,16 @@ class Search:
             best = fewer
         return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
-    def _rival(self, best: Candidate, other: Candidate) -> bool:
+    def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
             return False
-        return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
+        if advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL:
+            return True
+        assert best.state is not None
+        sigma = best.state.linearised.target.sigma
+        noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
+        before, least, more = (float(s.losses.sum()) for s in (state, best.state, other.state))
+        return equally_wrong(before, least, more, noise)
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""
@@ -495,12 +529,10 @@ class Search:
 
     def bounds(self, state: ModelState) -> list[Bound]:
         """For every effect that is not in the model, the size from which it would have shown: three standard
-        errors beyond its estimate, at the typical shape."""
-        inflate = np.sqrt(
-            max(1.0, state.fit.loss / state.fit.residual.size)
-            * state.fit.residual.size
-            / effective_size(state.fit.residual)
-        )
+        errors beyond its estimate, at the typical shape. What `state` leaves counts as noise."""
+        # of what is left, which counts as noise; what was found and is not named is in it
+        variance = max(1.0, state.fit.loss / state.fit.residual.size)
+        correlation = residual_correlation(state.fit.residual)
         flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
         base = flat.T @ flat + np.diag(state.fit.precision)
         made = []
@@ -522,7 +554,8 @@ class Search:
                 moved[j] = u.mean + step
                 column = (at - state.linearised.residual(model, moved)).ravel() / step
                 cross = flat.T @ column
-                power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
+                absorbed = np.linalg.lstsq(base, cross, rcond=1e-12)[0]
+                power = float(column @ column - cross @ absorbed)
                 # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
                 kind = next(
                     p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name)
@@ -536,7 +569,9 @@ class Search:
                     worst[key] = np.inf
                     continue
                 estimate = float(column @ state.fit.residual.ravel()) / power
-                worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * inflate / np.sqrt(power))
+                own = (column - flat @ absorbed).reshape(*state.fit.residual.shape, 1)
+                stderr = np.sqrt(variance * spread(own, correlation) / power)
+                worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * stderr)
                 units[key] = u.unit
             made += [
                 Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan"))
@@ -593,7 +628,7 @@ class SearchOutcome:
     search: Search
     """With the weights of the last fit."""
     start: ModelState
-    """Without any of it, weighed as `search` does."""
+    """Without any of it, with its own weights."""
     last: ModelState
     """With alternative patterns."""
     state: ModelState

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_factor, cho_solve
 
+from fastrod.identification.search.correlation import correlated, residual_correlation
 from fastrod.types import Floats, Ints
 
 Residual = Callable[[Floats], Floats]
@@ -17,6 +18,8 @@ Residual = Callable[[Floats], Floats]
 Slopes = Callable[[Floats, Floats], Floats]
 """theta (p,), residual there -> d(predicted)/d(theta) over sigma, (n, n_out, p)."""
 
+BEYOND = 3.0
+"""Standard deviations of its prior: a parameter beyond is evidence of what the model lacks."""
 _SMALL_STEP = 1e-3  # of a standard error: below it a fit has arrived
 
 
@@ -34,6 +37,15 @@ class Estimate:
     prior_sd: float = float("nan")
     """nan: none."""
     at_bound: bool = False
+    prior_mean: float = float("nan")
+    """nan: none, or not said."""
+    prior_distance: float = 0.0
+    """From the prior's mean, in its sd; of what is fitted as a logarithm, that of the logarithms."""
+
+    @property
+    def beyond_prior(self) -> bool:
+        """Whether the data pull it so far from its prior that something else must be wrong."""
+        return abs(self.prior_distance) > BEYOND
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +136,27 @@ def _solve(A: Floats, b: Floats) -> Floats:
 
 
 def covariance(fit: Fit) -> Floats:
-    """(p, p) of the fitted numbers: priors and data, the data's variance as the residual shows it, correlated
-    samples counted less."""
+    """(p, p) of the fitted numbers: priors and data. The data's variance and how its rows know of each other
+    are those of the residual, so that what is left counts as the slow noise that it looks like. Whether the
+    model has the right form is not in it."""
     if not len(fit.theta):
         return np.zeros((0, 0))
-    inflate = (
-        max(1.0, fit.loss / max(fit.residual.size - len(fit.theta), 1))
-        * fit.residual.size
-        / effective_size(fit.residual)
-    )
-    flat = fit.slopes.reshape(-1, fit.slopes.shape[-1])
-    return np.asarray(np.linalg.pinv(flat.T @ flat / inflate + np.diag(fit.precision)))
+    variance = max(1.0, fit.loss / max(fit.residual.size - len(fit.theta), 1))
+    return covariance_of(fit.slopes, fit.precision, residual_correlation(fit.residual), variance)
+
+
+def covariance_of(slopes: Floats, precision: Floats, correlation: Floats, variance: float = 1.0) -> Floats:
+    """(p, p) of a least-squares fit with `slopes` (n, n_out, p) and priors' `precision` (p,), whose rows have
+    this `variance` and this autocorrelation (k,); never less than that of independent rows."""
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    gram = flat.T @ flat
+    plain = np.asarray(np.linalg.pinv(gram / variance + np.diag(precision)))
+    if len(correlation) < 2:
+        return plain
+    middle = flat.T @ correlated(slopes, correlation).reshape(flat.shape) / variance
+    found = plain @ (0.5 * (middle + middle.T) + np.diag(precision)) @ plain
+    more = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(found), 1e-300), 1.0))
+    return np.asarray(found * more[:, None] * more[None, :])
 
 
 def effective_size(residual: Floats) -> float:
