@@ -170,10 +170,11 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     seen.button("STOP").click()
     assert seen.until(lambda: bed.page.session.stopped)
     assert bed.stands(seen)
+    assert "emergency stop was pressed" in bed.link.supervisor.status  # nothing had stopped it before
     there = bed.link.change()
     bed.bend(seen, "End")
     assert bed.stands(seen)
-    assert bed.says(seen, "emergency stop was pressed")
+    assert bed.says(seen, "emergency stop was pressed"), bed.link.supervisor.status
     bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.stands(seen)
