@@ -36,6 +36,7 @@ from fastrod.solver.response import stretch
 from fastrod.solver.state import Observer, Pose, State, check_on_robot
 from fastrod.solver.statics import DIVERGED
 from fastrod.solver.stepper import unloaded
+from fastrod.threads import one_blas_thread
 from fastrod.types import Floats, Ports
 
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
@@ -79,7 +80,7 @@ class Simulator(Motions):
         `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times
         as many nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a
         five-segment robot.
-        `threads` defaults to numba's; 1 is the serial twin. `contact` is what the rods may touch; without it
+        `threads` defaults to numba's. `contact` is what the rods may touch; without it
         they pass through everything. Without `feel_contact` they do so all the same, and the scene is for
         `clearance`, `swept_clearance` and `ray_cast` alone. While a robot's last residual is below
         `kept_jacobian_tolerance` [m] (and it feels no contact) a step corrects the boundary by the Jacobian
@@ -138,6 +139,7 @@ class Simulator(Motions):
         return f"Simulator({self.robots[0].name!r}{others}, {numbers}{contact}{device})"
 
     @named_inputs
+    @one_blas_thread
     def step(
         self,
         tendon_length: ArrayLike | None = None,
@@ -210,6 +212,7 @@ class Simulator(Motions):
         return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
 
     @named_inputs
+    @one_blas_thread
     def settle(
         self,
         tendon_length: ArrayLike | None = None,
@@ -357,6 +360,7 @@ class Simulator(Motions):
         )
         return found
 
+    @one_blas_thread
     def jacobian(self, *, turning: bool = False) -> Floats:
         """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or
         N]), world frame.
@@ -402,6 +406,7 @@ class Simulator(Motions):
         change: Floats = jacobian + by_force @ inverse @ (slopes @ jacobian[:, :3] + moved)
         return change
 
+    @one_blas_thread
     def compliance(self) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation
         and contact forces held."""
@@ -475,6 +480,7 @@ class Simulator(Motions):
             )
         return self._engine
 
+    @one_blas_thread
     def measure(self) -> SensedPoses:
         """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in
         the base frame, effects of sensing included. Effects before the rod show in the state itself. Raises

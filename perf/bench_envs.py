@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -101,6 +104,40 @@ def reach_section(quick: bool) -> Section:
     )
 
 
+def busy() -> subprocess.Popen[bytes]:
+    """A process that keeps one core busy."""
+    return subprocess.Popen([sys.executable, "-c", "while True: pass"])
+
+
+def threads_section(quick: bool) -> Section:
+    """One thread and two, alone and beside a process that keeps one core busy."""
+    n, most = (64 if quick else 1024), max(thread_counts())
+    rows: list[Row] = []
+    for beside in (False, True):
+        other, rate = busy() if beside else None, 0.0
+        for threads in dict.fromkeys((1, most)):
+            note_progress(f"{threads} threads{', beside a busy process' if beside else ''}")
+            env = BatchEnv("Reach", n, threads=threads)
+            begun = time.perf_counter(), time.process_time()
+            took = step_seconds(env, steps_for(n, quick), 1 if quick else 5)
+            wall, cpu = time.perf_counter() - begun[0], time.process_time() - begun[1]
+            rows.append(row("beside a busy process" if beside else "alone", n, threads, took))
+            rate = rate or n / took
+            rows[-1] |= {"cpu": cpu / wall, "ratio": n / took / rate}
+            env.close()
+        if other is not None:
+            other.kill()
+            other.wait()
+    return table(
+        "threads",
+        "Reach: one thread and more",
+        "kind machine | n:,d N | threads:d | rate:,.0f env steps/s | cpu:.2f CPU s per second"
+        "| ratio:.2f rate to~that of one thread",
+        rows,
+        "Random actions. Nothing is set in the environment. Warm, best of several runs.",
+    )
+
+
 def task_section(quick: bool) -> Section:
     """Every other task, few steps: a batch where the rods are one simulator's, otherwise one environment."""
     rows: list[Row] = []
@@ -149,7 +186,8 @@ def endurance_section(total: int) -> Section:
 def measure(options: Any) -> list[Section]:
     if options.endurance:
         return [endurance_section(0 if options.quick else options.endurance)]
-    return [reach_section(options.quick), task_section(options.quick)]
+    quick = options.quick
+    return [reach_section(quick), threads_section(quick), task_section(quick)]
 
 
 main = bench(

@@ -136,7 +136,7 @@ def _instrument() -> None:
             held = vars(importlib.import_module(info.name))
             held.update({name: _Math() for name, value in held.items() if value is math})
             held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
-    body = vars(boundary)["pass_serial"]
+    body = vars(boundary)["pass_robots"]
 
     def counting(*arguments: Any) -> None:
         counted: list[Any] = [a if isinstance(a, RodShape) else _countable(a) for a in arguments]
@@ -146,7 +146,7 @@ def _instrument() -> None:
         for kept, new in zip(arguments[memory], counted[memory], strict=True):
             kept[...] = new.astype(float)
 
-    vars(boundary)["pass_serial"] = counting
+    vars(boundary)["pass_robots"] = counting
 
 
 def _countable(argument: Any) -> Any:

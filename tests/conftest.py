@@ -10,8 +10,18 @@ from pathlib import Path
 
 import numba
 import pytest
+from cost import Cost
 from rods import Table
 from truthfiles import rows
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--quick", action="store_true", help="leave out the functions in tests/costs.json")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Cost(config), "cost")
+
 
 # commands that tests run compile at any time, and their stderr is read
 os.environ.setdefault("FASTROD_QUIET", "1")
@@ -47,9 +57,10 @@ def one_compilation() -> Iterator[None]:
     if numba.config.DISABLE_JIT:
         return
     from fastrod.kernels import batch
+    from fastrod.kernels.jit import OnThreads
     from fastrod.kernels.rod import cold
 
-    big = [f"{what}_{how}" for what in ("pass", "iterate", "search") for how in ("serial", "parallel")]
-    counts = {name: len(getattr(batch, name).signatures) for name in (*big, "move_to_inputs")}
-    counts["begin"] = len(cold.begin.signatures)
-    assert {name: n for name, n in counts.items() if n > 1} == {}
+    large = {name: loop.one for name, loop in vars(batch).items() if isinstance(loop, OnThreads)}
+    large |= {"move_to_inputs": batch.move_to_inputs, "begin": cold.begin}
+    large |= {"pass_modes": batch.pass_modes, "derive_modes": batch.derive_modes}
+    assert {name: len(one.signatures) for name, one in large.items() if len(one.signatures) > 1} == {}

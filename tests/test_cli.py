@@ -66,6 +66,7 @@ def refused(capsys: Captured, line: str) -> str:
     return err
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("straight")
 def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, capsys: Captured) -> None:
     out = tmp_path / "out"
@@ -84,6 +85,7 @@ def test_replay_of_one_run_into_the_default_folder(log: Path, tmp_path: Path, mo
     assert len((tmp_path / "log_replay" / "residuals.csv").read_text().splitlines()) == 2
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("straight")
 def test_replay_knows_a_measured_set_by_its_header(tmp_path: Path, capsys: Captured) -> None:
     path = tmp_path / "raw.csv"
@@ -137,6 +139,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.study
 def test_identify_prints_the_verdict_and_names_its_files(
     measured: Path, tmp_path: Path, capsys: Captured
 ) -> None:
@@ -152,6 +155,7 @@ def test_identify_prints_the_verdict_and_names_its_files(
     assert json.loads((out / "report.json").read_text())["held_out"] == ["two"]
 
 
+@pytest.mark.study
 def test_identify_json_prints_json_and_nothing_else(
     measured: Path, tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
@@ -335,6 +339,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return out, printed.getvalue()
 
 
+@pytest.mark.study
 def test_demo_names_what_was_sealed_into_its_emulator(demo: tuple[Path, str]) -> None:
     out, printed = demo
     made, loop = (json.loads((out / name).read_text()) for name in ("report.json", "loop.json"))
@@ -394,6 +399,7 @@ def no_device(monkeypatch: Patch) -> None:
     monkeypatch.setattr("fastrod.commands.demo.find_spec", lambda name: None)
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("no_device")
 def test_demo_without_the_device_wing_names_what_was_sealed_into_its_log(
     tmp_path: Path, capsys: Captured

@@ -68,6 +68,7 @@ def rows(text: str) -> dict[str, list[float]]:
 # ---------------------------------------------------------------- track
 
 
+@pytest.mark.study
 def test_track_by_the_model_and_by_the_policy(run: Run, tmp_path: Path) -> None:
     code, out, err = run("track", "--emulate", "--seed", EASY, TAUT)
     assert (code, err) == (0, "")
@@ -114,6 +115,7 @@ def test_nothing_is_written_over(run: Run, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- calibrate, register, latency
 
 
+@pytest.mark.study
 def test_calibrate_finds_the_hidden_lens(run: Run, tmp_path: Path) -> None:
     code, out, err = run("calibrate", "--emulate", "--seed", "3", "--views", "12")
     assert (code, err) == (0, "")
@@ -143,6 +145,7 @@ def test_calibrate_finds_the_hidden_lens(run: Run, tmp_path: Path) -> None:
     assert "in mine.toml" in out
 
 
+@pytest.mark.study
 def test_register_finds_the_hidden_place(run: Run, tmp_path: Path) -> None:
     code, out, err = run("register", "--emulate", "--seed", "4", "--views", "16")
     assert (code, err) == (0, "")
@@ -162,6 +165,7 @@ def test_register_finds_the_hidden_place(run: Run, tmp_path: Path) -> None:
     assert replace(camera, position=CAMERA.position, quaternion=CAMERA.quaternion) == CAMERA
 
 
+@pytest.mark.study
 def test_register_at_places_that_are_given(run: Run) -> None:
     board = CharucoBoard(columns=5, rows=4, square=0.02, marker=0.014)
     place = [f"{number:.6f}" for part in boards.fixtures(CAMERA, board)[0] for number in part]
@@ -200,6 +204,7 @@ def test_register_with_a_real_camera_asks_for_each_place(run: Run, monkeypatch: 
     assert "true" not in out
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", [EASY, LATE])
 def test_latency(run: Run, tmp_path: Path, seed: str) -> None:
     code, out, err = run("latency", "--emulate", "--seed", seed, TAUT, "--out", "camera.toml")
@@ -214,6 +219,7 @@ def test_latency(run: Run, tmp_path: Path, seed: str) -> None:
 # ---------------------------------------------------------------- pictures of a board
 
 
+@pytest.mark.study
 def test_pictures_that_are_collected_differ() -> None:
     board = CharucoBoard(columns=7, rows=5, square=0.02, marker=0.015)
     clock = SteppedClock()
@@ -298,6 +304,7 @@ def test_a_bench_that_is_not_there_failed(run: Run, tmp_path: Path) -> None:
     assert "cannot be opened; is it plugged in" in err.splitlines()[-1]
 
 
+@pytest.mark.study
 def test_what_was_recorded_before_a_stop_is_told(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -106,6 +106,7 @@ def test_the_cuda_compiler_takes_the_kernels() -> None:
     assert done.stdout.split() == ["run", "_move", "_all_finite", "_put_rows"]
 
 
+@pytest.mark.study
 def test_the_benchmark_says_what_it_can(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

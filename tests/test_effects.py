@@ -104,6 +104,7 @@ def assert_same(one: Seen, two: Seen, rows_one: Any = slice(None), rows_two: Any
         assert_array_equal(a[:, rows_one], two[name][:, rows_two], err_msg=name)
 
 
+@pytest.mark.study(beyond=4)
 @ROBOTS
 @pytest.mark.parametrize("name", NAMES)
 def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot) -> None:
@@ -123,6 +124,7 @@ def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
     assert_same(*(run(simulator(r), commands(robot), moving=True) for r in (robot, everything)))
 
 
+@pytest.mark.study(beyond=20)
 @ROBOTS
 @pytest.mark.parametrize("name", NAMES)
 def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: Robot) -> None:
@@ -142,6 +144,7 @@ def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: 
     assert_array_equal(seen["measured points"].shape, (N_STEPS, N_ROBOTS, len(robot.log_points), 3))
 
 
+@pytest.mark.study(beyond=7)
 @pytest.mark.parametrize("name", NAMES)
 def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     robot = two_segments()
@@ -166,6 +169,7 @@ def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     assert_same(fresh, after, [1], [1])
 
 
+@pytest.mark.study(beyond=9)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None:
     robots = [having(two_segments(), at_typical(name, two_segments(), times)) for times in (0.0, 1.0, 1.4)]
@@ -175,6 +179,7 @@ def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None
         assert_same(run(simulator(robot, 1), lengths, rows=[i]), together, [0], [i])
 
 
+@pytest.mark.study(beyond=5)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_bad_input_spoils_no_memory(name: str) -> None:
     """Robot 1 misses two steps: the others do not notice, and it goes on as if these two had not been."""

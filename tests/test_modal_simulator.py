@@ -168,6 +168,7 @@ for name, threads in (("one", 1), ("two", 2)):
 """
 
 
+@pytest.mark.study
 def test_threads_change_no_bit(tmp_path: Path) -> None:
     """In a process of its own, which has two threads wherever this one has one."""
     angle, robot = np.random.default_rng(3).uniform(-1.0, 1.0, (200, 2)), load_robot("prototype")
@@ -211,6 +212,7 @@ def test_one_bad_row_leaves_its_neighbours_alone() -> None:
         assert_same(state, clean.step(**inputs(heavy(), k)), rest)
 
 
+@pytest.mark.study(beyond=31)
 @BOTH
 @pytest.mark.parametrize("name", NAMES)
 def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, options: dict[str, Any]) -> None:
@@ -226,6 +228,7 @@ def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, options: dict
         assert_array_equal(a, b)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["backlash", "friction", "creep", "tendon_stretch", "gravity"])
 def test_effects_of_slow_motion_are_those_of_the_rod_at_rest(name: str) -> None:
     """Their memories see the same tendons: to the inertia of a bend there and back within 4 s."""

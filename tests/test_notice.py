@@ -1,10 +1,13 @@
-"""The line on stderr before kernels are compiled: once a process, and not where they are cached."""
+"""What happens around a compilation: a line on stderr before the large kernels, once a process and not where
+they are cached, and no garbage collection."""
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,14 +16,16 @@ from fastrod.kernels import batch, notice
 
 SCRIPT = """
 import numpy as np
+from fastrod.kernels import notice
 from fastrod.kernels.operators import play, relaxation
+notice.SECONDS["play"] = "backlash", 1
 one = np.zeros((1, 1))
 play(np.zeros((1, 1, 1)), np.zeros((1, 3)), one, one)
 relaxation(np.zeros((1, 1, 1)), np.zeros((1, 2)), one, one + 1.0, np.ones(1))
 print("done")
 """
-"""Two small kernels."""
-LINE = "Compiling kernels, about 30 s, "
+"""Two small kernels, one of which counts as large."""
+LINE = "Compiling the kernels of backlash, about 1 s, "
 
 
 def said(folder: Path | str, **environment: str) -> str:
@@ -33,11 +38,13 @@ def said(folder: Path | str, **environment: str) -> str:
     return done.stderr
 
 
+@pytest.mark.study
 def test_a_compilation_says_so_once_and_a_cached_kernel_says_nothing(tmp_path: Path) -> None:
     assert said(tmp_path) == f"{LINE}once.\n"
     assert said(tmp_path) == ""
 
 
+@pytest.mark.study
 def test_it_is_silent_on_request(tmp_path: Path) -> None:
     assert said(tmp_path, FASTROD_QUIET="1") == ""
 
@@ -50,20 +57,45 @@ class Compilation:
         self.py_func = function
 
 
+@pytest.fixture
+def listener(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[notice._Around]:
+    monkeypatch.delenv("FASTROD_QUIET", raising=False)
+    yield notice._Around(getattr(request, "param", True))
+    gc.enable()
+
+
 @pytest.mark.parametrize(
-    ("cached", "how_often"),
+    ("listener", "how_often"),
     [
         (True, "once"),
         (False, "in each process, for no cache folder can be written (FASTROD_CACHE_DIR names one)"),
     ],
+    indirect=["listener"],
 )
-def test_the_kernels_of_contact_have_a_line_of_their_own(
-    cached: bool, how_often: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_each_group_of_large_kernels_has_one_line(
+    listener: notice._Around, how_often: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delenv("FASTROD_QUIET", raising=False)
-    listener = notice._Notice(cached)
-    for name in (*notice._CONTACT, "pass_serial", "iterate_serial"):
+    for name in ("search_some", "iterate_some", "pass_some", "place_all", "pass_modes"):
         listener.on_start(Compilation(getattr(batch, name).py_func))
+        listener.on_end(None)
     listener.on_start(Compilation(os.getenv))  # somebody else's
-    lines = (f"Compiling contact kernels, about two minutes, {how_often}.", f"{LINE}{how_often}.")
-    assert capsys.readouterr().err.splitlines() == list(lines)
+    groups = (notice.SECONDS[name] for name in ("iterate_some", "pass_some", "pass_modes"))
+    lines = [f"Compiling the kernels of {what}, about {seconds} s, {how_often}." for what, seconds in groups]
+    assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_garbage_is_not_collected_until_the_outermost_compilation_ends(listener: notice._Around) -> None:
+    for _ in range(2):
+        listener.on_start(Compilation(os.getenv))
+        assert not gc.isenabled()
+    listener.on_end(None)
+    assert not gc.isenabled()
+    listener.on_end(None)
+    assert gc.isenabled()
+
+
+def test_garbage_is_left_alone_where_the_user_collects_none(listener: notice._Around) -> None:
+    gc.disable()
+    listener.on_start(Compilation(os.getenv))
+    listener.on_end(None)
+    assert not gc.isenabled()

@@ -66,6 +66,7 @@ def contents(wheel: Path) -> list[str]:
         return sorted(archive.namelist())
 
 
+@pytest.mark.study
 def test_the_wheel_has_five_packages_and_the_trained_policies(wheel: Path) -> None:
     names = contents(wheel)
     packages = {name.split("/")[0] for name in names if not name.startswith("fastrod-")}
@@ -73,6 +74,7 @@ def test_the_wheel_has_five_packages_and_the_trained_policies(wheel: Path) -> No
     assert len([name for name in names if name.endswith("/actor.npz")]) == 10
 
 
+@pytest.mark.study
 def test_the_sdist_builds_the_same(artifacts: list[Path], wheel: Path, tmp_path: Path) -> None:
     (sdist,) = (a for a in artifacts if a.name.endswith(".tar.gz"))
     with tarfile.open(sdist) as archive:
@@ -86,6 +88,7 @@ def test_every_extra_of_a_user_is_tried() -> None:
     assert {*ALSO} == {"", *EXTRAS} - {"all", "peers", "test"}
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("extra", ALSO)
 def test_it_works_in_an_empty_environment_with_one_extra(extra: str, wheel: Path, tmp_path: Path) -> None:
     uv = shutil.which("uv", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")

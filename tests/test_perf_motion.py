@@ -50,6 +50,7 @@ def test_the_rod_that_is_pulled_slowly_bends_as_the_elastica() -> None:
     assert across == pytest.approx(0.062, abs=1e-3)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("name", "rungs"),
     [
@@ -81,6 +82,7 @@ def test_all_in_one_call_is_one_after_the_other(name: str) -> None:
         np.testing.assert_allclose(together(force), each, rtol=0, atol=1e-9)
 
 
+@pytest.mark.study
 def test_the_bench_runs_and_what_is_missing_is_a_sentence(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

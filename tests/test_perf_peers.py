@@ -156,6 +156,7 @@ def test_only_points_that_none_beats_are_on_the_front() -> None:
     assert bench_peers.front(made) == [(1.0, 1e-3), (2.5, 1e-5)]
 
 
+@pytest.mark.study
 def test_the_bench_runs_and_what_is_missing_is_a_sentence(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -40,6 +40,7 @@ def test_the_peers_slopes_agree(tension: float) -> None:
         np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-9)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("paper", [True, False])
 def test_the_peer_solves_the_same_rod(paper: bool) -> None:
     from cases import LINE, appendix_b_robot, arc_lengths
@@ -55,6 +56,7 @@ def test_the_peer_solves_the_same_rod(paper: bool) -> None:
     np.testing.assert_allclose(tip, expected.tip_position, atol=1e-8)
 
 
+@pytest.mark.study
 def test_the_count_of_operations_is_linear_in_the_steps() -> None:
     import flops
 
@@ -63,6 +65,7 @@ def test_the_count_of_operations_is_linear_in_the_steps() -> None:
     assert all(tally.flops > 1e4 for tally in at_five.values())
 
 
+@pytest.mark.study
 def test_the_observer_and_rods_of_modes_are_measured_on_the_same_inputs() -> None:
     import rod_modal
 
@@ -304,6 +307,7 @@ def test_the_control_bench_runs_and_both_follow_the_path(capsys: pytest.CaptureF
     assert max(exact["error_m"], differences["error_m"]) < 1e-3
 
 
+@pytest.mark.study
 def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
     tables = measured(capsys, "hosts")
     rows = {row["what"]: row for row in tables["hosts"]}
@@ -339,6 +343,7 @@ def test_heavy_upright_robots_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     assert math.isfinite(count.growth + count.peak)
 
 
+@pytest.mark.study
 def test_the_energy_that_the_campaign_counts_is_kept() -> None:
     """Second order: a quarter of a millisecond leaves some 1e-4 of what goes from bend to motion and back."""
     import motion_steps

@@ -27,6 +27,7 @@ EXAMPLES = [
 ]
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(("code", "output"), EXAMPLES)
 def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()

@@ -248,6 +248,7 @@ def test_shipped_log_does_not_say_what_is_in_it() -> None:
     assert not any(name in " ".join(head) for name in plant.LIBRARY)
 
 
+@pytest.mark.study
 def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None:
     """A log by another solver: the robot that it was made on leaves the solvers' steps alone."""
     log = log_of_the_other()

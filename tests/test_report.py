@@ -96,6 +96,7 @@ KEYS = (
 )
 
 
+@pytest.mark.study
 def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     made = report.to_json(result)
     assert set(made) >= set(KEYS.split())
@@ -171,6 +172,7 @@ class Reader(HTMLParser):
             self.words += data
 
 
+@pytest.mark.study
 def test_page_is_one_offline_file(html: str) -> None:
     read = Reader(html)
     assert read.open == []
@@ -197,6 +199,7 @@ def test_page_says_verdict_effects_and_what_to_run(result: Result, html: str) ->
         assert title in words
 
 
+@pytest.mark.study
 def test_page_escapes_what_others_wrote_and_takes_what_is_missing(result: Result) -> None:
     html = page(wild(result))
     read = Reader(html)
@@ -210,6 +213,7 @@ def test_page_escapes_what_others_wrote_and_takes_what_is_missing(result: Result
     assert "nan" not in plain.lower()
 
 
+@pytest.mark.study
 def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None:
     bare = replace(result, effects=[], path=result.path[:1], after=result.before, tried=[], bounds=[])
     bare = replace(bare, correlation=(["a"], np.ones((1, 1))), advice=[], summary="No effect explains it.")
@@ -220,6 +224,7 @@ def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None
     assert "Correlations" not in words
 
 
+@pytest.mark.study
 def test_files_are_written_whole(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = report.write(result, tmp_path / "out")
     assert [path.name for path in written] == ["report.json", "report.html", "identified.toml"]
@@ -239,6 +244,7 @@ def test_files_are_written_whole(result: Result, tmp_path: Path, monkeypatch: py
     assert not list((tmp_path / "out").glob("*.part"))
 
 
+@pytest.mark.study
 def test_identified_robot_loads_and_simulates(result: Result, tmp_path: Path) -> None:
     robot = load_robot(report.write(result, tmp_path)[2])
     assert "backlash" in (tmp_path / "identified.toml").read_text()

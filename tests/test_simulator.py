@@ -40,6 +40,7 @@ for name, threads in (("one", 1), ("two", 2)):
 """
 
 
+@pytest.mark.study
 def test_threads_change_no_bit(tmp_path: Path) -> None:
     """In a process of its own, which has two threads wherever this one has one."""
     np.save(tmp_path / "lengths.npy", random_lengths(200, 3))
@@ -222,6 +223,7 @@ def test_unknown_names_answer_with_the_near_ones() -> None:
         fastrod.Simulater  # noqa: B018
 
 
+@pytest.mark.study
 def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
     """The cache folder is named after every kernel source: another source, another folder."""
     script = "from fastrod.kernels import jit; print(jit._cache_dir())"

@@ -119,6 +119,7 @@ def words_of(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
 
 
+@pytest.mark.study(beyond=64)
 @pytest.mark.parametrize("file", sources(*PACKAGES), ids=lambda file: str(file.relative_to(ROOT)))
 def test_no_identifier_has_a_word_that_is_gone(file: Path) -> None:
     allowed = ALLOWED.get(file.relative_to(ROOT).as_posix(), "").split()
@@ -150,6 +151,7 @@ def test_names_in_the_expressions_of_f_strings_are_seen() -> None:
     assert "way" not in seen
 
 
+@pytest.mark.study
 def test_a_public_class_name_stands_for_one_class() -> None:
     places = defaultdict(list)
     for file in sources(*PACKAGES):

@@ -333,6 +333,14 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     bench = commands.add_parser("bench", help="how fast, how accurate, beside what")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
+
+    warmup = commands.add_parser("warmup", help="compile the kernels now, not in the first step")
+    warmup.add_argument(
+        "groups",
+        nargs="*",
+        metavar="GROUP",
+        help="rod, contact (with what it needs of the rod), modes (default: all)",
+    )
     parser.commands = {action.dest: action.help or "" for action in commands._get_subactions()}
     return parser, list(commands.choices)
 

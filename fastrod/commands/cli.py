@@ -397,6 +397,14 @@ def _script(path: Path, argv: list[str]) -> int:
         sys.path.remove(str(path.parent))
 
 
+def _warmup(arguments: argparse.Namespace) -> int:
+    from fastrod.commands.warmup import warm_up
+
+    with _progress() as bar:
+        warm_up(arguments.groups, bar)
+    return DONE
+
+
 _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "demo": _demo,
     "replay": _replay,
@@ -409,6 +417,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "evaluate": _evaluate,
     "generate": _generate,
     "bench": _bench,
+    "warmup": _warmup,
 }
 """Functions of the commands."""
 

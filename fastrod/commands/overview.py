@@ -8,7 +8,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "look": ("demo", "view"),
     "measure and explain": ("excite", "drive", "identify", "replay"),
     "learn": ("envs", "train", "evaluate"),
-    "scale and compare": ("generate", "bench"),
+    "scale and compare": ("generate", "bench", "warmup"),
 }
 """Every command once."""
 _EXAMPLES = (

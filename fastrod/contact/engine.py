@@ -12,7 +12,7 @@ from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import addresses, pack
 from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
-from fastrod.kernels.batch import arrange, search_parallel, search_serial, search_worlds
+from fastrod.kernels.batch import arrange, search_gaps, search_worlds
 from fastrod.kernels.contact.iteration import NOTHING
 from fastrod.kernels.contact.problem import MOST_FOUND, contact_problem
 from fastrod.kernels.contact.proximity import search_work
@@ -175,9 +175,8 @@ class Engine:
         found, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         one = np.ones(1)
         motion = self.motion(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
-        body = search_serial if threads == 1 else search_parallel
         work = search_work(threads, shape.arclength.shape[1])
-        body(rows, self.rods, self.surfaces, motion, found, n_found, work)
+        search_gaps(threads, rows, self.rods, self.surfaces, motion, found, n_found, work)
         if self.rods_meet:
             self.lower_gaps(rows, motion)
         some[rows] = (self.clearance.gap[rows] < 0.0) | (n_found < 0)

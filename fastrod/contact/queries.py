@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from fastrod.contact.engine import Engine, motion_of, unknown_clearance
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
-from fastrod.kernels.batch import cast_rays, search_serial
+from fastrod.kernels.batch import cast_rays, search_gaps
 from fastrod.kernels.contact.problem import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.types import CANDIDATE, Flags, Floats, Ints, RodShape
@@ -70,7 +70,7 @@ def _gap(
     some = np.flatnonzero(finite if rows is None else finite & rows)
     if len(surfaces.primitive):
         found, n_found = np.empty((len(some), MOST_FOUND), CANDIDATE), np.zeros(len(some), np.int64)
-        search_serial(some, engine.rods, surfaces, motion, found, n_found, search_work(1, n_points))
+        search_gaps(1, some, engine.rods, surfaces, motion, found, n_found, search_work(1, n_points))
     if only is None and engine.rods_meet:
         engine.lower_gaps(some, motion)
     gap = np.full(n, np.nan)

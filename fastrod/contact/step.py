@@ -18,7 +18,7 @@ from fastrod.contact.engine import Engine, starts_of
 from fastrod.contact.frames import blended, longest_move
 from fastrod.contact.progress import Damping, Progress
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT
-from fastrod.kernels.batch import iterate_parallel, iterate_serial
+from fastrod.kernels.batch import iterate_contact
 from fastrod.kernels.contact.iteration import AT_REST, BACK, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
 from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, PointLoads, Ports, RodShape
 
@@ -307,8 +307,7 @@ class ContactStep:
         homeless = (loads.node < 0) & (np.arange(n_loads) < used[:, None])
         status = np.zeros(n, np.int64)
         each = ContactRows(start, rows, status, engine.trouble, self.solver.x)
-        body = iterate_serial if threads == 1 else iterate_parallel
-        body(each, engine.rods, engine.surfaces, motion, contacts, loads, problem, search)
+        iterate_contact(threads, each, engine.rods, engine.surfaces, motion, contacts, loads, problem, search)
         for r in np.flatnonzero(homeless.any(1)):  # more contacts than nodes: one without has not been felt
             c = contact[r, homeless[r].argmax()]
             far = engine.trouble["from_rest"][rows[r]]

@@ -27,6 +27,7 @@ from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
+from fastrod.threads import one_blas_thread
 
 MAX_EFFECTS = 4
 # samples that the search looks at; the operators run over all, and what is found is fitted to all
@@ -39,6 +40,7 @@ _SPARE = 2
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
+@one_blas_thread
 def identify(
     logs: RunLog | Sequence[RunLog],
     robot: Robot,

@@ -1,9 +1,6 @@
-"""A batch of robots: the only `prange`, and its serial twin from one body."""
+"""A batch of robots: what Python calls, and the only `prange`."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from types import FunctionType
 
 import numpy as np
 from numba import prange
@@ -33,7 +30,7 @@ from .contact.iteration import ContactIteration, iterate_worlds, search_robots
 from .contact.node_placement import place_nodes
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import ray_hit
-from .jit import LANES, entry, parallel_entry
+from .jit import LANES, OnThreads, call_at, entry, parallel_entry
 from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
 from .rod.gather import predict
 from .rod.lanes import Lanes
@@ -51,7 +48,10 @@ def move_to_inputs(robots: Lanes, ports: Ports, params: Params, memory: Memory, 
     predict(robots, len(robots), ports, params, memory, layout)
 
 
-def _pass(
+@entry
+def pass_some(
+    task: int,
+    n_tasks: int,
     run: Run,
     params: Params,
     ports: Ports,
@@ -61,20 +61,39 @@ def _pass(
     response: Response,
     loads: PointLoads,
 ) -> None:
-    """One forward pass of the robots of `run`, chunk by chunk, in as many tasks as its scratch has rows."""
-    n, n_tasks = len(run.robots), run.scratch.shape[0]
+    """One forward pass of every n-th chunk of the robots of `run`, as this task of n."""
+    n = len(run.robots)
+    batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
+    mode = Mode(run.n_col, run.predict, run.propagate, run.update, run.process, run.noise)
+    lanes = np.empty(LANES, np.int64)
+    for start in range(task * LANES, n, n_tasks * LANES):
+        count = min(LANES, n - start)
+        for w in range(LANES):
+            lanes[w] = run.robots[start + min(w, count - 1)]
+        pass_chunk(Chunk(lanes, count, start), batch, output, run.scratch[task], mode)
+
+
+@parallel_entry
+def _pass_on_threads(
+    address: int,
+    n_tasks: int,
+    run: Run,
+    params: Params,
+    ports: Ports,
+    layout: Layout,
+    memory: Memory,
+    shape: RodShape,
+    response: Response,
+    loads: PointLoads,
+) -> None:
     for task in prange(n_tasks):
-        batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
-        mode = Mode(run.n_col, run.predict, run.propagate, run.update, run.process, run.noise)
-        lanes = np.empty(LANES, np.int64)
-        for start in range(task * LANES, n, n_tasks * LANES):
-            count = min(LANES, n - start)
-            for w in range(LANES):
-                lanes[w] = run.robots[start + min(w, count - 1)]
-            pass_chunk(Chunk(lanes, count, start), batch, output, run.scratch[task], mode)
+        call_at(address, task, n_tasks, run, params, ports, layout, memory, shape, response, loads)
 
 
-def _iterate(
+@entry
+def iterate_some(
+    task: int,
+    n_tasks: int,
     rows: ContactRows,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -84,11 +103,27 @@ def _iterate(
     problem: ContactProblem,
     search: SearchWork,
 ) -> None:
-    """One contact iteration of every world (`iterate_worlds`), on as many threads as there are workspaces."""
-    for thread in prange(len(problem.first_point)):
-        iterate_worlds(
-            thread, ContactIteration(rows, rods, surfaces, motion, contacts, loads, problem, search)
-        )
+    """One contact iteration of every n-th world (`iterate_worlds`), as this task of n; there is a workspace
+    for each."""
+    batch = ContactIteration(rows, rods, surfaces, motion, contacts, loads, problem, search)
+    iterate_worlds(task, n_tasks, batch)
+
+
+@parallel_entry
+def _iterate_on_threads(
+    address: int,
+    n_tasks: int,
+    rows: ContactRows,
+    rods: ContactRods,
+    surfaces: Surfaces,
+    motion: ContactMotion,
+    contacts: ContactSet,
+    loads: PointLoads,
+    problem: ContactProblem,
+    search: SearchWork,
+) -> None:
+    for task in prange(n_tasks):
+        call_at(address, task, n_tasks, rows, rods, surfaces, motion, contacts, loads, problem, search)
 
 
 @entry
@@ -136,7 +171,10 @@ def arrange(
     return fits
 
 
-def _search(
+@entry
+def search_some(
+    task: int,
+    n_tasks: int,
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -145,9 +183,25 @@ def _search(
     n_found: Ints,
     work: SearchWork,
 ) -> None:
-    """Smallest gap of each robot and, in row order, its candidates for contact (`search_robots`)."""
-    for thread in prange(len(work.known)):
-        search_robots(thread, rows, rods, surfaces, motion, found, n_found, work)
+    """Smallest gap of every n-th robot, as this task of n, and its candidates for contact
+    (`search_robots`)."""
+    search_robots(task, n_tasks, rows, rods, surfaces, motion, found, n_found, work)
+
+
+@parallel_entry
+def _search_on_threads(
+    address: int,
+    n_tasks: int,
+    rows: Ints,
+    rods: ContactRods,
+    surfaces: Surfaces,
+    motion: ContactMotion,
+    found: Records,
+    n_found: Ints,
+    work: SearchWork,
+) -> None:
+    for task in prange(n_tasks):
+        call_at(address, task, n_tasks, rows, rods, surfaces, motion, found, n_found, work)
 
 
 @entry
@@ -213,17 +267,6 @@ def derive_modes(
         derivatives_of_modes(lanes, count, run, batch, unknowns, work, out)
 
 
-def _named(body: Callable[..., None], name: str) -> Callable[..., None]:
-    """The body under a name of its own: numba's cache would hand the serial code to a parallel function of
-    the same name."""
-    twin = FunctionType(body.__code__, body.__globals__, name)
-    twin.__qualname__ = name
-    return twin
-
-
-pass_serial = entry(_named(_pass, "pass_serial"))
-pass_parallel = parallel_entry(_named(_pass, "pass_parallel"))
-iterate_serial = entry(_named(_iterate, "iterate_serial"))
-iterate_parallel = parallel_entry(_named(_iterate, "iterate_parallel"))
-search_serial = entry(_named(_search, "search_serial"))
-search_parallel = parallel_entry(_named(_search, "search_parallel"))
+pass_robots = OnThreads(pass_some, _pass_on_threads)
+iterate_contact = OnThreads(iterate_some, _iterate_on_threads)
+search_gaps = OnThreads(search_some, _search_on_threads)

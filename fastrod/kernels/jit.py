@@ -11,7 +11,9 @@ import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -27,6 +29,20 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _config: Any = numba.config
 _njit: Any = numba.njit  # its type does not know _nrt
 _intrinsic: Any = intrinsic  # untyped
+_star: Any = types.StarArgTuple
+_typeof: Any = numba.typeof
+
+
+def _let_threads_sleep() -> None:
+    """Load OpenMP so that its threads sleep while they wait: spinning, they take the cores from whoever they
+    wait for (a training took eight times as long on two busy cores). It reads this variable once."""
+    if ours := "OMP_WAIT_POLICY" not in os.environ:
+        os.environ["OMP_WAIT_POLICY"] = "passive"
+    with suppress(ImportError):  # numba then takes another pool
+        import_module("numba.np.ufunc.omppool")
+    if ours:
+        del os.environ["OMP_WAIT_POLICY"]
+
 
 LANES = 16
 """Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
@@ -66,6 +82,7 @@ def _cache_dir() -> str | None:
 CACHE_DIR = _cache_dir()
 """Where compiled kernels are kept, or None."""
 announce(cached=CACHE_DIR is not None)
+_let_threads_sleep()
 
 
 def kernel(function: _Function) -> _Function:
@@ -138,13 +155,16 @@ def pointed(function: _Function, signature: Any) -> tuple[_Function, int]:
     """`function` compiled by itself for one signature, and its address in this process for a `caller`: the
     kernels that call it need not be compiled again. Without the compiler a number that stands for it."""
     function = getattr(function, "py_func", function)
-    if _config.DISABLE_JIT:
-        _POINTED.append(function)
-        return function, len(_POINTED)
-    compiled: Any = _compile(function, folder=_own_folder(function))
-    result = compiled.get_compile_result(signature)
+    compiled = function if _config.DISABLE_JIT else _compile(function, folder=_own_folder(function))
+    return compiled, _address_of(compiled, signature)
+
+
+def _address_of(compiled: Any, signature: Any) -> int:
     _POINTED.append(compiled)
-    return compiled, result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
+    if _config.DISABLE_JIT:
+        return len(_POINTED)
+    result = compiled.get_compile_result(signature)
+    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
 
 _POINTED: list[Any] = []
@@ -165,6 +185,17 @@ def _own_folder(function: Callable[..., Any]) -> str | None:
     return str(folder)
 
 
+def _call(context: Any, builder: Any, made: Any, given: Any) -> Any:
+    """Code that calls the function at the address given[0]."""
+    kind = context.call_conv.get_function_type(made.return_type, made.args[1:]).as_pointer()
+    status, result = context.call_conv.call_function(
+        builder, builder.inttoptr(given[0], kind), made.return_type, made.args[1:], given[1:]
+    )
+    with cgutils.if_unlikely(builder, status.is_error):  # type: ignore[no-untyped-call]
+        context.call_conv.return_status_propagate(builder, status)
+    return result
+
+
 def caller(signature: Any) -> Any:
     """A function for kernels, (address, a, b) -> what the function of this signature that is `pointed` there
     returns for a and b."""
@@ -172,15 +203,51 @@ def caller(signature: Any) -> Any:
         return lambda address, a, b: _POINTED[address - 1](a, b)
 
     def call(_: Any, address: Any, a: Any, b: Any) -> Any:  # noqa: ARG001
-        return signature.return_type(types.intp, *signature.args), generate
-
-    def generate(context: Any, builder: Any, made: Any, given: Any) -> Any:
-        kind = context.call_conv.get_function_type(made.return_type, made.args[1:]).as_pointer()
-        status, result = context.call_conv.call_function(
-            builder, builder.inttoptr(given[0], kind), made.return_type, made.args[1:], given[1:]
-        )
-        with cgutils.if_unlikely(builder, status.is_error):  # type: ignore[no-untyped-call]
-            context.call_conv.return_status_propagate(builder, status)
-        return result
+        return signature.return_type(types.intp, *signature.args), _call
 
     return _intrinsic(call)
+
+
+def _call_at(_: Any, address: Any, task: Any, n_tasks: Any, *given: Any) -> Any:  # noqa: ARG001
+    """Call the function of a task that is at this address: (task, n_tasks, *given) -> None."""
+    made = types.none(types.intp, types.intp, types.intp, _star(given))
+
+    def generate(context: Any, builder: Any, made: Any, packed: Any) -> Any:
+        each = cgutils.unpack_tuple(builder, packed[3])  # type: ignore[no-untyped-call]
+        return _call(context, builder, types.none(*made.args[:3], *given), [*packed[:3], *each])
+
+    return made, generate
+
+
+call_at: Any = (
+    (lambda address, *given: _POINTED[address - 1](*given)) if _config.DISABLE_JIT else _intrinsic(_call_at)
+)
+
+
+class OnThreads:
+    """A kernel that does one task of n, done for all of them: by itself, or each on a thread of its own.
+
+    The loop over threads calls what is compiled already by its address. Had it the kernel in it, LLVM would
+    compile that a second time (30 s for a pass of the rod, 3 s for the loop alone).
+    """
+
+    def __init__(self, one: Callable[..., None], loop: Callable[..., None]) -> None:
+        self.one, self._loop, self._address = one, loop, 0
+
+    def __call__(self, n_tasks: int, *given: Any) -> None:
+        """Do all `n_tasks` with what is given, side by side if there is more than one."""
+        if n_tasks == 1:
+            self.one(0, 1, *given)
+            return
+        if not self._address:
+            self._address = self._compiled(given)
+        self._loop(self._address, n_tasks, *given)
+
+    def _compiled(self, given: Sequence[Any]) -> int:
+        """Compile both for what is given, and refuse anything else: the loop trusts the address."""
+        signature = types.none(types.intp, types.intp, *(() if _config.DISABLE_JIT else map(_typeof, given)))
+        if not _config.DISABLE_JIT:
+            loop: Any = self._loop
+            loop.compile(signature)
+            loop.disable_compile()
+        return _address_of(self.one, signature)

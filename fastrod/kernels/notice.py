@@ -1,8 +1,9 @@
-"""Say on stderr that a kernel is being compiled: a first run that prints nothing for half a minute looks
-hung."""
+"""What happens around the compilation of a kernel: a line on stderr, for a first run that prints nothing for
+half a minute looks hung, and no garbage collection, which finds nothing and takes a tenth of the time."""
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from typing import Any
@@ -10,35 +11,48 @@ from typing import Any
 from numba.core import event
 
 _register: Any = event.register  # it has no types
-_LONG = ("fastrod.kernels.", "fastrod.solver.")
-_SHORT = "fastrod.kernels.vec"  # of a kernel, or of a shape of contact, which is compiled in a second
-_CONTACT = ("iterate_serial", "iterate_parallel", "search_serial", "search_parallel")
+_PLACE = "fastrod.kernels."
+SECONDS = {
+    "pass_some": ("the rod", 40),
+    "search_some": ("contact", 60),
+    "iterate_some": ("contact", 60),
+    "pass_modes": ("modes", 60),
+    "derive_modes": ("derivatives of modes", 15),
+}
+"""What the large kernels compute, and how long each group takes to compile on one core of 2025 [s]
+(`fastrod warmup`)."""
 
 
-class _Notice(event.Listener):
-    """Print one line when the first kernel of a process is compiled, and one for the first of contact."""
+class _Around(event.Listener):
+    """Print one line before each group of kernels that is compiled in a process, and collect no garbage until
+    the outermost compilation has ended."""
 
     def __init__(self, cached: bool) -> None:
         why = "in each process, for no cache folder can be written (FASTROD_CACHE_DIR names one)"
         self._how_often = "once" if cached else why
         self._printed: set[str] = set()
+        self._depth, self._collects = 0, False
 
     def on_start(self, what: Any) -> None:
         """Print, unless `FASTROD_QUIET` is set or this line was printed before."""
+        if self._depth == 0:
+            self._collects = gc.isenabled()
+            gc.disable()
+        self._depth += 1
         function = what.data["dispatcher"].py_func
-        module = function.__module__
-        if os.environ.get("FASTROD_QUIET") or not module.startswith(_LONG) or module == _SHORT:
-            return
-        contact = function.__name__ in _CONTACT
-        work = "Compiling contact kernels, about two minutes" if contact else "Compiling kernels, about 30 s"
-        if work not in self._printed:
-            self._printed.add(work)
-            print(f"{work}, {self._how_often}.", file=sys.stderr, flush=True)
+        group = SECONDS.get(function.__name__) if function.__module__.startswith(_PLACE) else None
+        if group and not os.environ.get("FASTROD_QUIET") and group[0] not in self._printed:
+            self._printed.add(group[0])
+            line = f"Compiling the kernels of {group[0]}, about {group[1]} s, {self._how_often}."
+            print(line, file=sys.stderr, flush=True)
 
-    def on_end(self, what: Any) -> None:
-        """Print nothing: the answer to the call follows."""
+    def on_end(self, what: Any) -> None:  # noqa: ARG002
+        """Collect garbage again, if it was collected before."""
+        self._depth -= 1
+        if self._depth == 0 and self._collects:
+            gc.enable()
 
 
 def announce(cached: bool) -> None:
     """Print a line on stderr before kernels are compiled in this process, `cached` for later ones or not."""
-    _register("numba:compile", _Notice(cached))
+    _register("numba:compile", _Around(cached))

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.kernels.batch import move_to_inputs, pass_parallel, pass_serial
+from fastrod.kernels.batch import move_to_inputs, pass_robots
 from fastrod.kernels.jit import LANES
 from fastrod.kernels.rod.workspace import Mode, Run, scratch_size
 from fastrod.solver.gpu.device import Device
@@ -285,8 +285,8 @@ class BoundarySolver:
         tasks = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
         n_tendons, n_e = len(self.layout.tendon_segment), self.n_residuals(ports)
         scratch = np.empty((tasks, scratch_size(n_tendons, self.n_x, n_col, n_e, n_loads)))
-        body = pass_serial if tasks == 1 else pass_parallel
-        body(Run(rows, scratch, *mode), self.params, ports, self.layout, self._memory, shape, response, loads)
+        run = Run(rows, scratch, *mode)
+        pass_robots(tasks, run, self.params, ports, self.layout, self._memory, shape, response, loads)
 
     def collect(self, shape: RodShape, only: str | None = None) -> RodShape:
         """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""

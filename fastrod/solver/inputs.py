@@ -278,7 +278,7 @@ class Reader:
     def _follower_line(self, value: ArrayLike, grid: Floats) -> Floats:
         line = self._line("follower_line_force", value, grid)
         shape = len(line), len(self.layout.first_tendon), *line.shape[2:]
-        return np.ascontiguousarray(np.broadcast_to(line, shape))
+        return np.array(np.broadcast_to(line, shape), order="C")  # a view would be read-only: another type
 
     def _line(self, name: str, value: ArrayLike, grid: Floats) -> Floats:
         """As `Ports` has it: (n, 1, 1, 3) of one force, (n, n_segments, 2 n_steps, 3) of samples."""

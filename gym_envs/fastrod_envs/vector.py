@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
+from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats
 from fastrod_envs.episodes import Episodes, Singles
 from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
@@ -93,6 +94,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         """(n,) steps of the episodes under way."""
         return self._episodes.elapsed.copy()
 
+    @one_blas_thread
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Singles, dict[str, Any]]:
@@ -134,6 +136,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             )
         return list(seed)
 
+    @one_blas_thread
     def step(self, actions: ArrayLike) -> tuple[Singles, Floats, Flags, Flags, dict[str, Any]]:
         """One step of all environments: `actions` (n, n_actions); observations (n, size), rewards, terminated
         and truncated (n,), infos.
@@ -162,6 +165,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             observation = np.where(done[:, None], begun, observation)
         return observation, moment.reward, moment.terminated, moment.truncated, infos
 
+    @one_blas_thread
     def baseline(self) -> Singles:
         """(n, n_actions) what the task's scripted baseline does now."""
         return self.task.baseline().astype(np.float32)

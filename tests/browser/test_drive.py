@@ -31,6 +31,7 @@ def at_rest(app: App) -> bool:
     return bool(clients and np.linalg.norm(clients[0].camera.position - begins) < 1e-2)
 
 
+@pytest.mark.study
 def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window: Windows) -> None:
     app.open("prototype")
     seen = window(app.address)
@@ -55,6 +56,7 @@ def last_drag(app: App, seen: Window) -> np.ndarray:
     return now
 
 
+@pytest.mark.study
 def test_the_tip_follows_a_drag(app: App, window: Windows) -> None:
     app.open("five_segment_reacher")
     seen = window(app.address)
@@ -121,6 +123,7 @@ def test_another_scene_is_picked_in_the_page(app: App, window: Windows) -> None:
     assert seen.errors == []
 
 
+@pytest.mark.study
 def test_a_load_bends_the_robot(app: App, window: Windows) -> None:
     app.open("tdcr_b")
     seen = window(app.address)
@@ -130,6 +133,7 @@ def test_a_load_bends_the_robot(app: App, window: Windows) -> None:
     assert seen.until(lambda: float(tip_of(app)[0] - before[0]) > 1e-3)
 
 
+@pytest.mark.study
 def test_two_pages_show_the_same_and_closing_one_changes_nothing(app: App, window: Windows) -> None:
     app.open("prototype")
     first, second = window(app.address), window(app.address)
@@ -188,6 +192,7 @@ def test_a_websocket_opens_from_its_own_page(app: App, window: Windows, page: st
     assert opened == let_in
 
 
+@pytest.mark.study
 def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     robot = fastrod.load_robot("prototype")
     link = SimulatedRobot(robot, real=True)

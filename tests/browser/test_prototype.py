@@ -124,6 +124,7 @@ def bed(app: App) -> Iterator[Bed]:
         app.close()
 
 
+@pytest.mark.study
 def test_a_person_drives_it_and_the_page_shows_what_it_says(bed: Bed, window: Windows) -> None:
     seen = window(bed.app.address)
     bed.bend(seen, "End")
@@ -146,6 +147,7 @@ def test_a_person_drives_it_and_the_page_shows_what_it_says(bed: Bed, window: Wi
     assert seen.errors == []
 
 
+@pytest.mark.study
 def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) -> None:
     hardware = load_hardware()
     # 0.56 rad; the slider goes to 61 degrees by its tendons
@@ -164,6 +166,7 @@ def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) 
         app.close()
 
 
+@pytest.mark.study
 def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) -> None:
     seen = window(bed.app.address)
     bed.slowly(seen)
@@ -184,6 +187,7 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     assert seen.until(lambda: bool(bed.link.change()[0] > there[0] + 2e-4))
 
 
+@pytest.mark.study
 def test_stop_only_stops_however_often_it_is_pressed(bed, window, monkeypatch):
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
@@ -212,6 +216,7 @@ def test_stop_only_stops_however_often_it_is_pressed(bed, window, monkeypatch):
         assert each.errors == []
 
 
+@pytest.mark.study
 def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed, window):
     seen = window(bed.app.address)
     assert bed.says(seen, "marker seen")
@@ -229,6 +234,7 @@ def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed
     assert bed.says(seen, "The robot follows commands.")
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("how", ["closed", "frozen"])
 def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     seen, other = window(bed.app.address), window()
@@ -252,6 +258,7 @@ def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     assert other.until(lambda: not bed.page.session.stopped)
 
 
+@pytest.mark.study
 def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed, window, tmp_path):
     seen = window(bed.app.address)
     seen.tab("Save")
@@ -278,6 +285,7 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed, window, 
     assert seen.errors == []
 
 
+@pytest.mark.study
 def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Windows) -> None:
     with Popen(DRIVE, cwd=tmp_path, stdout=PIPE, stderr=PIPE, text=True) as process:
         line = process.stdout.readline()

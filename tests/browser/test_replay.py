@@ -67,6 +67,7 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     assert seen.errors == []
 
 
+@pytest.mark.study
 def test_before_and_after_can_be_switched(app, window, tmp_path, log_with_report):
     app.open(load(log_with_report))
     seen = window(app.address)
@@ -107,6 +108,7 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
     assert seen.errors == []
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("what", ["prototype", DEMO_LOG])
 def test_an_exported_page_opens_from_disk_without_a_network(app, window, tmp_path, what):
     app.open(what)

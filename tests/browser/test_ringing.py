@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from rods import rod
 from windows import Window
 
@@ -29,6 +30,7 @@ def energy(page: DrivePage) -> float:
     return float(state.kinetic_energy[0] + state.strain_energy[0])
 
 
+@pytest.mark.study
 def test_a_pulled_tip_let_go_rings_and_dies_down(app: App, window: Callable[..., Window]) -> None:
     app.open(FreeWorld(damped(), dt=2e-3, dynamics=True))
     seen = window(app.address)

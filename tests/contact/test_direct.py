@@ -86,6 +86,7 @@ def places(rng, solid, n):
     return np.vstack([rng.uniform(-0.7, 0.7, (n, 3)) * size, (pick * weight[..., None]).sum(axis=1) + away])
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", SOLIDS)
 def test_point_agrees_with_brute_force(name):
     rng = np.random.default_rng(1)
@@ -160,6 +161,7 @@ def segments(rng, solid, n):
     )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", SOLIDS)
 def test_segment_agrees_with_brute_force(name):
     rng = np.random.default_rng(2)
@@ -316,6 +318,7 @@ def holds(obstacle, p):
     return math.dist(p, (0.0, 0.0, min(max(z, -b / 2), b / 2))) < a
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("obstacle", PRIMITIVES, ids=lambda o: o.name)
 def test_primitives_know_their_nearest_surface_point(obstacle):
     rng = np.random.default_rng(6)

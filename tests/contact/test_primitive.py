@@ -63,6 +63,7 @@ def test_an_ellipsoid_of_equal_radii_is_a_sphere():
             assert_allclose([first, second], 1.0 / math.hypot(*p), rtol=1e-12)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("size", RADII, ids=str)
 def test_the_closest_point_is_where_a_minimiser_finds_it(size):
     rng = np.random.default_rng(2)
@@ -97,6 +98,7 @@ def test_the_normal_is_the_slope_of_the_distance(size):
     assert_allclose(normal[smooth], slope[smooth], rtol=0, atol=1e-5)
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("size", RADII, ids=str)
 def test_points_on_the_planes_of_symmetry_have_their_distance(size):
     a = np.array(size)
@@ -122,6 +124,7 @@ def settled(touched: Obstacle, pull: float = 12.0) -> fastrod.State:
     return state
 
 
+@pytest.mark.study
 def test_a_rod_on_an_ellipsoid_rests_as_on_its_fine_mesh():
     radii, place = (0.008, 0.02, 0.012), {"position": (0.018, 0.0, 0.05)}
     ball = trimesh.creation.icosphere(subdivisions=6, radius=1.0)
@@ -276,6 +279,7 @@ def run(script: str, *arguments: str, folder: Path | None = None) -> str:
     return done.stdout
 
 
+@pytest.mark.study
 def test_a_stranger_brings_a_shape_in_a_package_of_its_own(tmp_path, capsys):
     """As it lies once it is installed: one file, and its entry point. The kernels of contact are not compiled
     for it, and an edit of it is not missed."""
@@ -298,6 +302,7 @@ def test_a_stranger_brings_a_shape_in_a_package_of_its_own(tmp_path, capsys):
         assert plate[6] == pytest.approx(0.4)
 
 
+@pytest.mark.study
 def test_a_simulator_goes_on_in_another_process(tmp_path):
     """Compiled shapes stand elsewhere there."""
     scene = ContactScene(

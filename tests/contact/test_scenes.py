@@ -8,9 +8,10 @@ import numba
 import numpy as np
 import pytest
 
-from fastrod.kernels.batch import iterate_serial
+from fastrod.kernels.batch import iterate_some
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("seed", "index", "rows"),
     [
@@ -39,6 +40,7 @@ def test_no_scene_is_deeper_than_it_says(scenes, seed, index, rows):
     assert len(played.sentences) == (~played.ok).sum()
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("index", "row"),
     [
@@ -74,4 +76,4 @@ def test_several_robots_beside_an_obstacle_at_rest_slide_off_by_the_same_kernels
     for lengths in batch.tendon_length[:, [1, 1, 1]]:
         state = sim.step(lengths)
         assert np.array_equal(state.ok, [state.ok[0]] * 3)
-    assert len(iterate_serial.signatures) == 1
+    assert len(iterate_some.signatures) == 1

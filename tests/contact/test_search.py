@@ -31,6 +31,7 @@ def _search(curve, options, surfaces, frames, distance, position, work, found):
     )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("nearest", [False, True])
 @pytest.mark.parametrize("radius", [0.0, 0.002, 0.012])
 def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):

@@ -92,6 +92,7 @@ def test_rod_that_lies_on_a_soft_floor_needs_no_contact_at_every_place(stiffness
     assert press[0] > 0.5e-3 * stiffness  # the rod is clamped 1 mm inside, and its first contact hardly moves
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("dt", [1e-3, 5e-2])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_at_rest_nothing_chatters(dt, friction):
@@ -216,6 +217,7 @@ def test_batch_equals_robots_alone():
         assert_allclose(batch.contacts.total_force[i], one.contacts.total_force[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.study
 def test_adversarial_starts_and_jumps_end_outside_or_flagged():
     """Random balls and boxes, robots cold in the middle of them, then random jumps."""
     rng = np.random.default_rng(7)

@@ -163,6 +163,7 @@ def direct(obstacle, pose, points):
     return scene, np.array([f.distance for f in found]), np.array([f.normal for f in found])
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", SOLIDS)
 def test_a_mesh_is_as_far_as_the_direct_path_says(name):
     rng = np.random.default_rng(1)
@@ -415,6 +416,7 @@ def test_the_normal_turns_as_the_curvature_says(name):
         assert set(rank) == {0, 1, 2}
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", [*SOLIDS, "tetrahedron"])
 def test_every_triangle_is_in_one_leaf_and_every_box_holds_what_is_below(name):
     tetrahedron = trimesh.Trimesh(

@@ -96,6 +96,7 @@ def test_nearest_is_stationary() -> None:
     assert_allclose(tip, given.nearest[given.n_approach :], atol=1e-6)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_is_made_up_for(name: str) -> None:
     robot, given, bare = with_effects(name), made(name), made()
@@ -109,6 +110,7 @@ def test_an_effect_is_made_up_for(name: str) -> None:
     assert error == pytest.approx(given.rms_distance, abs=1e-5)
 
 
+@pytest.mark.study
 def test_all_at_once_and_a_camera_that_is_off() -> None:
     names = ("backlash", "friction", "creep", "gravity", "latency")
     seen_by = {"name": "frame_misalignment", "rotation_x": 0.03, "shift_x": 5e-4}

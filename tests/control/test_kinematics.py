@@ -129,6 +129,7 @@ def test_limits_are_the_range_of_extension_and_the_largest_bend() -> None:
     assert np.arccos(state.tip_rotation[0, 2, 2]) == pytest.approx(0.8, abs=1e-3)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(("base", "q_base"), BASES)
 def test_the_loop_closes_on_a_point_that_can_be_reached(base: Any, q_base: list[float]) -> None:
     tip = soft_tip(base)

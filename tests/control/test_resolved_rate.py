@@ -65,6 +65,7 @@ def test_the_posture_is_approached_in_the_null_space() -> None:
         assert_allclose(far, expected, atol=1e-9)
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("size", [0.1, 3.0, 30.0])
 @pytest.mark.parametrize("with_posture", [False, True])
 def test_no_limit_is_ever_left_and_the_direction_is_kept(size: float, with_posture: bool) -> None:

@@ -152,6 +152,7 @@ ACTORS: dict[str, tuple[Callable[[Originals], bytes], str]] = {
 }
 
 
+@pytest.mark.study(beyond=12)
 @pytest.mark.parametrize("name", ACTORS)
 def test_a_damaged_actor_is_one_sentence(
     name: str, tmp_path: Path, originals: Originals, capsys: Captured
@@ -365,6 +366,7 @@ def test_a_mesh_opens_no_other_file_and_logs_nothing(
     assert not logging.getLogger("trimesh.util").filters
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("file", "words"), [("rows", "declares 160000000 values"), ("words", "of 100000000000 bytes of text")]
 )

@@ -121,6 +121,7 @@ def tried_call(sim: Simulator, call: str, given: dict[str, Any]) -> State | None
     return state
 
 
+@pytest.mark.study
 @tried(80)
 @given(
     given_=inputs(),

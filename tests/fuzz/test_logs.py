@@ -129,6 +129,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("logs")
 
 
+@pytest.mark.study
 @tried(200)
 @given(text=texts())
 def test_an_odd_csv_is_a_log_or_a_sentence(folder: Path, text: str) -> None:
@@ -213,6 +214,7 @@ def test_an_odd_parquet_is_a_log_or_a_sentence(folder: Path, data: st.DataObject
     assert read(path) is None
 
 
+@pytest.mark.study
 @tried(8)
 @given(text=texts())
 def test_replay_of_an_odd_log_answers(folder: Path, text: str) -> None:

@@ -73,6 +73,7 @@ def test_a_good_robot_is_read_written_and_simulated(path: Path, table: dict[str,
     simulated(robot, path)
 
 
+@pytest.mark.study
 @tried(120)
 @given(table=mutated_tables())
 def test_a_changed_table_is_a_robot_or_a_sentence(path: Path, table: dict[str, Any]) -> None:

@@ -53,6 +53,7 @@ def begin(*_: object, **__: object) -> int:
     raise BegunError
 
 
+@pytest.mark.study
 @tried(150)
 @given(command=st.sampled_from(COMMANDS) | odd_words, rest=st.lists(words, max_size=5))
 def test_words_are_a_command_or_a_sentence(command: str, rest: list[str]) -> None:

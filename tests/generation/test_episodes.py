@@ -72,6 +72,7 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
     assert table["seed"].max() > 2**40  # 32 bits would hold doubles from some ten thousand episodes on
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(
     "work",
     [
@@ -141,6 +142,7 @@ def test_values_of_effects_are_of_their_typical_size() -> None:
     assert np.mean(ball**3) == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.study
 def test_a_sweep_names_what_it_sealed() -> None:
     table = made(Sweep(robot=PLAIN, effects=("backlash",), rate=4.0), 1)
     sealed, found = json.loads(table["sealed"][0]), json.loads(table["found"][0])
@@ -152,6 +154,7 @@ def test_a_sweep_names_what_it_sealed() -> None:
     assert table["floor"][0] == pytest.approx(3e-4 * np.sqrt(3.0), rel=0.3)
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("no_verdict")
 def test_effects_alternate_and_a_log_without_a_verdict_is_kept() -> None:
     work = Sweep(robot=PLAIN, effects=("creep", "backlash"), rate=1.0)

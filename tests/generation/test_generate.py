@@ -70,6 +70,7 @@ def test_what_is_made_is_reported_and_read_back(whole: Path) -> None:
     assert first[b"fastrod_plan"].decode() == small().hash
 
 
+@pytest.mark.study
 def test_two_processes_make_the_same_bits(whole: Path, tmp_path: Path) -> None:
     steps: list[tuple[str, int, int]] = []
     summary = generate(small(), tmp_path, workers=2, progress=lambda *step: steps.append(step))
@@ -79,6 +80,7 @@ def test_two_processes_make_the_same_bits(whole: Path, tmp_path: Path) -> None:
     assert steps[-1] == ("shapes", 600, 600)
 
 
+@pytest.mark.study
 def test_a_killed_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path) -> None:
     killed: list[int] = []
 
@@ -113,6 +115,7 @@ generate(small(), sys.argv[1], workers=2, progress=die)
 """A command that is killed after its second shard: its workers are but a few shards ahead."""
 
 
+@pytest.mark.study
 def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
@@ -156,6 +159,7 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, copy: Path) -> No
     assert bits(copy) == bits(whole)
 
 
+@pytest.mark.study
 def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
     assert generate(small(count=575), tmp_path, workers=1).made == 12
     for name in ("row", "chain", "dl_1", "tip_x"):  # rows that are there stay what they are
@@ -258,6 +262,7 @@ def test_rows_that_are_doubled_are_found(copy: Path) -> None:
         generate(small(), copy, workers=1)
 
 
+@pytest.mark.study
 def test_an_interrupt_leaves_whole_shards_alone(whole: Path, tmp_path: Path) -> None:
     def interrupt(_: str, done: int, __: int) -> None:
         if done >= 150:

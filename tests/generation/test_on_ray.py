@@ -35,6 +35,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("written", [False, True])
 def test_a_killed_ray_worker_loses_and_doubles_nothing(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool
@@ -111,6 +112,7 @@ def test_a_folder_that_a_machine_cannot_write_is_named(tmp_path: Path) -> None:
     assert stat.S_ISREG((tmp_path / "probe").stat().st_mode)
 
 
+@pytest.mark.study
 def test_a_cluster_that_does_not_answer_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

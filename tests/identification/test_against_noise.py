@@ -41,6 +41,7 @@ def found(effect: str) -> Result:
     return identify(sealed(effect), load_robot("prototype"), threads=1)
 
 
+@pytest.mark.study
 def test_the_base_model_that_bounds_are_made_of_has_one_weight() -> None:
     """A bump is found and no effect: residual, slopes and weights are those of one fit, whatever weights the
     search had when the bump was taken off."""
@@ -76,6 +77,7 @@ def test_nothing_is_rejected_for_another_where_no_other_is_kept() -> None:
     assert not any("another explains more" in t.why for t in result.tried)
 
 
+@pytest.mark.study
 def test_the_headline_says_what_effects_do_in_millimetres() -> None:
     result = found("gravity")
     before, after, noise = (1e3 * x for x in (result.test.before, result.test.after, result.noise.floor))
@@ -83,6 +85,7 @@ def test_the_headline_says_what_effects_do_in_millimetres() -> None:
     assert result.summary.startswith(f"Adding gravity cuts the held-out error {start}")
 
 
+@pytest.mark.study
 def test_errors_with_and_without_outliers_are_both_there() -> None:
     """Ten held-out rows a centimetre off: the error without them is as before, and a note has the other."""
     log = sealed("gravity")
@@ -97,6 +100,7 @@ def test_errors_with_and_without_outliers_are_both_there() -> None:
     assert not any("outliers of what is left" in note for note in found("gravity").notes)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seconds", [5.0, 60.0])
 def test_a_short_log_claims_no_shares(seconds: float) -> None:
     log = found("gravity").log
@@ -108,6 +112,7 @@ def test_a_short_log_claims_no_shares(seconds: float) -> None:
     assert ("too short to say which share" in said) == (seconds < 10.0)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("longer", [0.0, 0.05])
 def test_a_parameter_beyond_its_prior_is_the_first_thing_said(longer: float) -> None:
     """Noise of 0.1 mm on the model's own tips, of a segment that is 5 % longer than a prior of 0.5 % says."""

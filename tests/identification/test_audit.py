@@ -58,6 +58,7 @@ def patterns() -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("seed", range(3))
 def test_white_noise_has_no_structure(seed: int) -> None:
     found = run(noise(seed))
@@ -67,6 +68,7 @@ def test_white_noise_has_no_structure(seed: int) -> None:
     assert found.z < 4.0
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("kind", ["static", "memory", "drift"])
 def test_what_is_planted_comes_out_as_its_kind(kind: str) -> None:
     for seed, fraction in ((0, 0.1), (1, 0.5)):

@@ -107,6 +107,7 @@ def test_blocks_as_short_as_the_noise_is_slow_know_of_each_other() -> None:
     assert blocks_alike(fades(0.98), N // _PIECES) > 1.3
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("case", [c for c in cases(12) if c.rho >= 0.9 and c.robot == "prototype"])
 def test_nothing_is_missing_on_a_clean_log_with_coloured_noise(case: object) -> None:
     """Sixty of these are `python perf/bench_noise.py`."""

@@ -79,6 +79,7 @@ def planted(name: str, seed: int) -> np.ndarray:
     return plant.pose(inputs(), plant.draw(seed, name))[0] - bare()
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("outside", "seed", "family"),
     # of contacts 1 to 6, 2 and 4 are taken for a patch: see below

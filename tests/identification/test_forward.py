@@ -129,6 +129,7 @@ def test_every_effect_with_a_memory_or_a_clock_is_here() -> None:
     assert not set(TABLES) & {table["name"] for table in STATIC}
 
 
+@pytest.mark.study(beyond=6)
 @pytest.mark.parametrize("name", TABLES)
 def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
     robot = having(two_segments(), {"name": name} | TABLES[name])

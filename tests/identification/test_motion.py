@@ -94,6 +94,7 @@ def found() -> Result:
     return identify(log, robot(fit=ALL), held_out=["other"], dynamics=True)
 
 
+@pytest.mark.study
 def test_parameters_are_recovered_within_their_standard_errors(found: Result) -> None:
     """Six of them, from commands and tip alone; 3 standard errors, or one log of 70 fails by chance."""
     names = {
@@ -124,6 +125,7 @@ def test_held_out_error_falls_to_the_noise(found: Result) -> None:
     assert segment.lumps[0].mass == found.base_parameters["segment.1.lump.1.mass"].value
 
 
+@pytest.mark.study
 def test_a_report_in_motion_says_what_was_not_tried() -> None:
     """Backlash that nobody declared is left in the residual, and is not called explained."""
     plant = robot(density=0.33, effects=({"name": "backlash", "half_width": 6e-4},))
@@ -155,6 +157,7 @@ def test_replay_in_motion_is_the_simulator() -> None:
     assert np.abs(still.tip_position - shown.tip_position[log.run == "a"]).max() > 1e-3
 
 
+@pytest.mark.study
 def test_uneven_samples_are_interpolated() -> None:
     """The same motion sampled off the steps: a cubic through steps of 1 ms."""
     plant, t = robot(), np.arange(60) * 0.01
@@ -177,6 +180,7 @@ def test_a_payload_is_a_mass_at_the_tip() -> None:
         replay(replace(log, payload=np.linspace(0.0, 0.01, len(log))), robot(), dynamics=True)
 
 
+@pytest.mark.study
 def test_what_rest_shows_is_fitted_at_rest() -> None:
     """Stretch and a lump's mass, from tips at rest: neither needs a time step."""
     plant, commanded = robot(**TRUE), 1.5 * commands(1, np.arange(80) * 0.025)
@@ -210,6 +214,7 @@ def test_what_cannot_be_fitted_is_refused() -> None:
         identify(log, robot(), dynamics=True, network=True)
 
 
+@pytest.mark.study
 def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant = robot()
     log = recorded(plant, {"a": 3}, np.arange(30) * 0.01, 0.0, step=1e-3)

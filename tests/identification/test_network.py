@@ -42,6 +42,7 @@ def noise() -> np.ndarray:
     return NOISE * np.random.default_rng(5).normal(size=(len(samples().log), 3))
 
 
+@pytest.mark.study
 def test_a_static_residual_is_predicted() -> None:
     """A corner of the workspace that is off by up to 3 mm: two thirds of it above the noise must go."""
     bend = route(one_segment()).bend(np.asarray(samples().log.dl))[:, 0]
@@ -71,6 +72,7 @@ def test_without_scikit_learn_it_says_what_to_install(monkeypatch: pytest.Monkey
         left(noise())
 
 
+@pytest.mark.study
 def test_it_is_reported_apart() -> None:
     """The same result, digit by digit, with a number beside it."""
     log, robot = backlash_log(), load_robot("prototype")

@@ -132,6 +132,7 @@ def alike(rho: float, seed: int, n: int = N) -> np.ndarray:
     return SIGMA * e
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
 def test_coloured_noise_is_read_as_large_as_it_is(rho: float) -> None:
     """Its variance is known from 690 (1 - rho^2) / (1 + rho^2) samples an axis, in the mean over six logs to

@@ -113,6 +113,7 @@ def found(name: str, drives: tuple[int, ...]) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", SIZES)
 @pytest.mark.parametrize("drive", [1, 2])
 def test_a_worn_drive_is_named(name: str, drive: int) -> None:
@@ -130,6 +131,7 @@ def test_a_worn_drive_is_named(name: str, drive: int) -> None:
     assert table[size][2 - drive] == 0.0
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", SIZES)
 def test_drives_that_are_alike_are_not_told_apart(name: str) -> None:
     result = found(name, (1, 2))

@@ -46,6 +46,7 @@ def late(nominal: Robot) -> RunLog:
     return replace(run, tip_position=tip, tip_quaternion=quaternion_from_matrix(turn.as_matrix()))
 
 
+@pytest.mark.study
 def test_the_base_fit_is_no_worse_than_the_model_as_it_was(late: RunLog, nominal: Robot) -> None:
     # no stiffness explains a delay: fitted, it must stay near the truth, and the error must not grow
     found = identify(late, nominal, max_effects=0)
@@ -55,6 +56,7 @@ def test_the_base_fit_is_no_worse_than_the_model_as_it_was(late: RunLog, nominal
     assert found.base_parameters["segment.*.bending_stiffness"].value == pytest.approx(1.1, rel=0.1)
 
 
+@pytest.mark.study
 def test_with_the_delay_found_the_stiffness_is_right(late: RunLog, nominal: Robot) -> None:
     found = identify(late, nominal)
     assert [effect.name for effect in found.effects] == ["latency"]

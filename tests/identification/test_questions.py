@@ -120,6 +120,7 @@ def identified(angle: float, distance: float, *, prior: bool = False) -> Result:
     return identify(seen(angle, distance), robot, threads=1)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("angle", "distance"), [(0.6, 0.34), (3.0, 1.0)])
 def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
     angle: float, distance: float, tmp_path: Path
@@ -143,6 +144,7 @@ def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
     assert again.questions == ()
 
 
+@pytest.mark.study
 def test_it_takes_no_more_than_with_the_right_prior() -> None:
     """Batches of the rod, which are the work."""
     far, prior = identified(0.6, 0.34), identified(0.6, 0.34, prior=True)
@@ -195,6 +197,7 @@ ASKED = {
 }
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_is_refused_with_a_guess(case: str) -> None:
     make, sentence = REFUSED[case]
@@ -204,6 +207,7 @@ def test_what_cannot_be_is_refused_with_a_guess(case: str) -> None:
     assert "far" in str(caught.value)
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("case", REFUSED | ASKED)
 def test_replay_asks_and_shows(case: str) -> None:
     make, sentence = (REFUSED | ASKED)[case]
@@ -287,6 +291,7 @@ def test_no_message_quotes_words_as_an_array_does(case: str) -> None:
     assert "np.str_" not in str(caught.value)
 
 
+@pytest.mark.study
 def test_a_jump_in_one_of_several_runs_is_told_by_its_name() -> None:
     """Half way through the second run the camera is moved by 20 mm."""
     log = names_of_runs()

@@ -44,6 +44,7 @@ def found(*names: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("names", [("slip",), ("slip", "backlash")])
 def test_a_slip_is_named_and_is_part_of_what_is_identified(names: tuple[str, ...]) -> None:
     result = found(*names)
@@ -64,10 +65,12 @@ def test_a_slip_is_named_and_is_part_of_what_is_identified(names: tuple[str, ...
     assert np.abs(shown - result.after).max() < 1e-5
 
 
+@pytest.mark.study
 def test_no_slip_is_named_where_none_was() -> None:
     assert [effect.name for effect in found("backlash").effects] == ["backlash"]
 
 
+@pytest.mark.study
 def test_runs_keep_their_own_time() -> None:
     """Of two runs a time since the start is ambiguous: the pattern stays one."""
     robot = two_segments()

@@ -44,6 +44,7 @@ def found(name: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 def test_a_spring_is_named_with_its_point() -> None:
     result = found("tip_spring")
     assert [effect.name for effect in result.effects] == ["tip_spring"]
@@ -58,6 +59,7 @@ def test_a_spring_is_named_with_its_point() -> None:
     assert np.abs(shown - result.after).max() < 1e-5
 
 
+@pytest.mark.study
 def test_a_constant_force_stays_one() -> None:
     result = found("tip_force")
     assert [effect.name for effect in result.effects] == ["tip_force"]

@@ -49,6 +49,7 @@ def found(*names: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 def test_tendons_that_interact_are_named() -> None:
     result = found("tendon_interaction")
     assert [effect.name for effect in result.effects] == ["tendon_interaction"]
@@ -60,6 +61,7 @@ def test_tendons_that_interact_are_named() -> None:
         assert weights[f"slope_{k}"].value == pytest.approx(slope, abs=4.0 * weights[f"slope_{k}"].stderr)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("sealed", [(), ("stiffening",)])
 def test_it_is_not_named_where_there_is_none_or_another_cause(sealed: tuple[str, ...]) -> None:
     result = found(*sealed)

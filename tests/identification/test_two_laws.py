@@ -33,6 +33,7 @@ def found(name: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 def test_a_drift_that_settles_is_told_from_one_that_goes_on() -> None:
     result = found("settling_drift")
     (effect,) = result.effects
@@ -47,6 +48,7 @@ def test_a_drift_that_settles_is_told_from_one_that_goes_on() -> None:
         assert estimate.stderr < 0.2 * abs(estimate.value)
 
 
+@pytest.mark.study
 def test_a_steady_drift_stays_one() -> None:
     result = found("time_drift")
     assert [effect.name for effect in result.effects] == ["time_drift"]
@@ -67,6 +69,7 @@ def rubbing(name: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
+@pytest.mark.study
 def test_friction_by_the_capstan_is_told_from_friction_that_knows_no_tension() -> None:
     result = rubbing("capstan_friction")
     (effect,) = result.effects
@@ -79,6 +82,7 @@ def test_friction_by_the_capstan_is_told_from_friction_that_knows_no_tension() -
     assert mu.stderr < 0.1
 
 
+@pytest.mark.study
 def test_friction_that_knows_no_tension_stays_so() -> None:
     result = rubbing("friction")
     assert [effect.name for effect in result.effects] == ["friction"]

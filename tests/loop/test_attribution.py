@@ -60,6 +60,7 @@ def value(result: Result, name: str, parameter: str) -> tuple[float, float]:
 NAMED = ("latency", "gravity", "drum_gain")
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("effect", NAMED)
 def test_a_hidden_effect_is_named_and_leaves_the_noise(effect: str) -> None:
     result = found(effect)
@@ -86,6 +87,7 @@ def test_sizes_are_those_in_the_seal() -> None:
     assert np.allclose([p.value for p in parameters.values()], gains, atol=0.1 * np.abs(gains).max() + 0.005)
 
 
+@pytest.mark.study
 def test_of_nothing_comes_nothing() -> None:
     result = found("none")
     assert (result.verdict, result.remaining_kind) == ("none", "none")
@@ -97,6 +99,7 @@ def test_of_nothing_comes_nothing() -> None:
     assert 0.0 < bounds["latency"].value < 0.05  # s
 
 
+@pytest.mark.study
 def test_one_sample_in_ten_thrown_off_changes_no_verdict() -> None:
     result = found("none", outliers=0.1)
     assert (result.verdict, list(result.effects)) == ("none", [])
@@ -105,6 +108,7 @@ def test_one_sample_in_ten_thrown_off_changes_no_verdict() -> None:
     assert result.noise.floor == pytest.approx(np.sqrt(3.0) * 3e-4, rel=0.1)
 
 
+@pytest.mark.study
 def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
     result = found("bump")
     assert (result.verdict, result.remaining_kind, list(result.effects)) == ("not_in_library", "drift", [])
@@ -115,6 +119,7 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
     assert said == pytest.approx(at, abs=0.03 * float(np.ptp(result.log.t)))
 
 
+@pytest.mark.study
 def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
     """One effect of several: for others a sibling fits to the noise."""
     result = found("stiffness_anisotropy", "stiffness_anisotropy")
@@ -124,6 +129,7 @@ def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
     assert result.remaining_fraction > 0.03
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("effect", ["latency", "gravity"])
 def test_the_identified_robot_predicts_what_the_report_says(effect: str, tmp_path: Path) -> None:
     """Written, read and replayed: the error on held-out rows is `after`, to the rod's step of settling."""
@@ -165,6 +171,7 @@ def same(one: Any, two: Any, where: str = "result") -> None:
         assert one == two or (one != one and two != two), where
 
 
+@pytest.mark.study
 def test_the_same_log_gives_the_same_result() -> None:
     again = identify(backlash_log(), robot(), held_out=["two"], threads=1)
     same(short(), again)
@@ -177,6 +184,7 @@ def test_play_in_the_wires_is_found_on_a_short_log() -> None:
     assert said == pytest.approx(GAP, abs=3.0 * stderr + 1e-5)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("change", ["noise", "elsewhere"])
 def test_no_fit_sees_what_is_held_out(change: str) -> None:
     """Tips of held-out rows are replaced: what was fitted, and what every candidate was worth, stays to the
@@ -241,6 +249,7 @@ BAD = {
 }
 
 
+@pytest.mark.study(beyond=8)
 @pytest.mark.parametrize("case", BAD)
 def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> None:
     make, sentence = BAD[case]
@@ -250,6 +259,7 @@ def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> 
     assert "small" in str(caught.value)
 
 
+@pytest.mark.study
 def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
     """Half of the motion is as predicted, so it is not refused; but no effect is made of it."""
     result = identify(other([1, 0, 2, 3]), robot(), threads=1)

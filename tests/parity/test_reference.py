@@ -62,6 +62,7 @@ def prototype(*pulled: float) -> tuple[Robot, np.ndarray]:
     return robot, robot.rest_tendon_length + np.array(pulled or (-0.004, -0.002, 0.004, 0.002))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("case", [0, 1, 3, 11, 12, 16, 22, 28])
 def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
     row = rows("tendon_length_truth.csv")[case]
@@ -76,6 +77,7 @@ def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
     assert_allclose(shape.tension, tension, rtol=0, atol=1e-7)
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("case", ["A01", "A07", "A09", "A15", "A23", "B25", "B29", "B33", "B35"])
 @pytest.mark.parametrize("mode", ["tendon_tension", "tendon_length"])
 def test_shoot_is_the_truth_on_a_chain(case: str, mode: Mode) -> None:
@@ -94,6 +96,7 @@ def test_shoot_is_the_truth_on_a_chain(case: str, mode: Mode) -> None:
     assert_allclose(shape.tension, tension, rtol=0, atol=TIP / compliance.min())
 
 
+@pytest.mark.study
 def test_shoot_is_the_truth_in_passive_mode() -> None:
     for row in rows("appJ_truth.csv")[::4]:
         shape = shoot(cantilever(), tip_force=(0.0, float(row["Fy_N"]), 0.0))
@@ -101,6 +104,7 @@ def test_shoot_is_the_truth_in_passive_mode() -> None:
         assert shape.curvature[0, 0] == pytest.approx(float(row["u0x_1_per_m"]), abs=1e-8)
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("case", [0, 36, 72])
 @pytest.mark.parametrize("method", ["lm", "slsqp", "trust-constr"])
 def test_shoot_is_the_truth_in_paper_mode(case: int, method: Any) -> None:
@@ -115,6 +119,7 @@ def test_shoot_is_the_truth_in_paper_mode(case: int, method: Any) -> None:
 
 
 # w/L of a cantilever under P L^2 / EI, elliptic integrals
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("load", "deflection"),
     [(1.0, 0.301720773800), (2.0, 0.493457480397), (5.0, 0.713791523612), (10.0, 0.810609024880)],
@@ -126,6 +131,7 @@ def test_elastica(load: float, deflection: float, method: Any) -> None:
     assert shape.tip_position[0] / LENGTH == pytest.approx(deflection, abs=1e-8)
 
 
+@pytest.mark.study
 def test_methods_and_integrators_agree() -> None:
     robot, length = prototype()
     best = shoot(robot, length, **LOADS)
@@ -139,6 +145,7 @@ def test_methods_and_integrators_agree() -> None:
             assert_allclose(other.position, best.position, rtol=0, atol=tolerance)
 
 
+@pytest.mark.study
 def test_collocation_agrees_with_shooting() -> None:
     robot, length = prototype()
     line = [[(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 0.0, 0.0)]]
@@ -152,6 +159,7 @@ def test_collocation_agrees_with_shooting() -> None:
     assert_allclose(two.tension, one.tension, rtol=0, atol=1e-6)
 
 
+@pytest.mark.study
 def test_collocation_agrees_with_shooting_on_a_chain() -> None:
     row = next(row for row in rows("tdcr_cases.csv") if row["case"] == "B33")
     robot = load_robot("tdcr_b")
@@ -192,6 +200,7 @@ def test_constant_curvature_takes_off_what_distal_tendons_use() -> None:
     assert_allclose(shape.curvature[-1, :2], second, rtol=0, atol=1e-9)
 
 
+@pytest.mark.study
 def test_the_base_pose_carries_the_whole_robot_along() -> None:
     robot, length = prototype()
     half = np.sqrt(0.5)
@@ -211,6 +220,7 @@ def test_self_weight_is_a_line_force() -> None:
     assert_allclose(weight.position, force.position, rtol=0, atol=1e-14)
 
 
+@pytest.mark.study
 def test_many_point_forces_are_a_line_force() -> None:
     n = 40
     points = [((k + 0.5) * LENGTH / n, np.array([0.0, 2.0, 0.0]) * LENGTH / n) for k in range(n)]
@@ -219,6 +229,7 @@ def test_many_point_forces_are_a_line_force() -> None:
     assert_allclose(lumped.position, spread.position, rtol=0, atol=1e-6)
 
 
+@pytest.mark.study
 def test_a_follower_force_rotates_with_the_tip() -> None:
     follower = np.array([0.2, 0.1, -0.1])
     robot, length = prototype()
@@ -234,6 +245,7 @@ def test_extension_is_a_longer_segment() -> None:
     assert_allclose(shape.position, longer.position, rtol=0, atol=1e-14)
 
 
+@pytest.mark.study
 def test_a_slack_tendon_pulls_no_more() -> None:
     robot = with_tendons(load_robot("prototype"), unilateral=True)
     length = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.006, 0.0])
@@ -248,6 +260,7 @@ def test_a_slack_tendon_pulls_no_more() -> None:
     assert_allclose((shape.tendon_length - length - 1e-5 * shape.tension)[~slack], 0.0, rtol=0, atol=TIP)
 
 
+@pytest.mark.study
 def test_a_mixed_chain_with_a_passive_end() -> None:
     first = load_robot("prototype").segments[0]
     tail = Segment(length=0.05, bending_stiffness=(EI, EI), torsional_stiffness=0.001, mode="passive")
@@ -264,6 +277,7 @@ def test_a_mixed_chain_with_a_passive_end() -> None:
     assert_allclose(one.curvature[-1], 0.0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.study
 def test_a_guess_saves_passes() -> None:
     robot, length = prototype()
     cold = shoot(robot, length, tip_force=(0.1, 0.2, -0.1))

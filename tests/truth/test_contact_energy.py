@@ -39,6 +39,7 @@ def extrapolated(coarse: Any, fine: Any) -> Any:
 
 # tip force [N] and tip z [m]; they belong to tendons that do not stretch: 1e-7 m/N moves z by less than 1e-6
 # m
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("kappa", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
 )
@@ -73,6 +74,7 @@ def test_bent_far_the_planar_answer_is_a_ridge() -> None:
     assert valley.total_force[0] / ridge.total_force[0] == pytest.approx(0.974, abs=2e-3)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["sphere", "two_segments"])
 def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
     case = {key: value for key, value in CASES[name].items() if key not in ("obstacle", "rho")}
@@ -87,6 +89,7 @@ def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
         assert_allclose(found, getattr(free, name), rtol=0, atol=atol)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", CASES)
 def test_signorini(name: str) -> None:
     """No node inside, no force that pulls, no force across a gap; and it is a minimum, not a ridge."""
@@ -131,6 +134,7 @@ def test_balance(name: str) -> None:
     assert_allclose(found.base_moment, -moment, rtol=0, atol=atol)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["bar", "sphere", "tube"])
 def test_base_force_is_the_work_of_moving_the_base(name: str) -> None:
     """dV/d(base position), by differences: it knows nothing of multipliers."""
@@ -144,6 +148,7 @@ def test_base_force_is_the_work_of_moving_the_base(name: str) -> None:
     assert_allclose(at_rest(name, 10).base_force, slope, rtol=0, atol=2e-5)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["bar", "sphere", "heavy", "tube"])
 def test_error_falls_with_the_square_of_the_element(name: str) -> None:
     found = [at_rest(name, n) for n in (10, 20, 40)]
@@ -154,6 +159,7 @@ def test_error_falls_with_the_square_of_the_element(name: str) -> None:
     assert near < 2e-5  # of the tip
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
     """Contact forces as point forces on the package's rod, a boundary value problem without obstacles."""

@@ -39,6 +39,7 @@ def obstacle_of(o: dict[str, Any]) -> Obstacle:
     return mesh(hole, position=o["point"], quaternion=to_axis(o["axis"]))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", list(CASES))
 def test_forces_and_shape(name: str) -> None:
     case = CASES[name]

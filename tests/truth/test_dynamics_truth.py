@@ -77,6 +77,7 @@ def tip_error(case: dict[str, Any], dt: float) -> float:
     return float(np.sqrt((off**2).sum(1).mean()) / case["l"])
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.skipif(not CASES, reason="../shared/truth/dynamics_truth.json is not there")
 @pytest.mark.parametrize("case", CASES, ids=[f"{c['id']} {c['kind']}" for c in CASES])
 def test_a_rod_moves_as_a_chain_of_links(case: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ def ring(n: int, offset: float) -> np.ndarray:
 
 
 # three and four tendons, compliances from 1.3e-6 to 1e-3 m/N
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("case", [0, 1, 3, 7, 11, 16, 24, 28])
 def test_least_energy_is_the_truth(case: int) -> None:
     row = rows("tendon_length_truth.csv")[case]
@@ -39,6 +40,7 @@ def test_least_energy_is_the_truth(case: int) -> None:
     assert_allclose(found.tension, numbers(row, *[f"T{i + 1}" for i in range(n)]), rtol=0, atol=1e-7)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("case", ["A07", "A15", "A21", "B29", "B33"])
 def test_least_energy_of_a_chain_is_the_truth(case: str) -> None:
     """Two segments; distal tendons keep their own offset through the proximal one (10, 10 mm and 8, 6 mm)."""

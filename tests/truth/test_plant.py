@@ -76,6 +76,7 @@ def bare(designed: plant.Inputs) -> np.ndarray:
 
 
 # 0.3 mm is the noise; the catalogue's lens reaches 1 % at the edge of a workspace of 30 mm
+@pytest.mark.study(beyond=15)
 @pytest.mark.parametrize("name", plant.library(1) + plant.OUTSIDE)
 def test_every_effect_moves_the_tip_by_its_size(name: str, designed: plant.Inputs, bare: np.ndarray) -> None:
     moved = plant.pose(designed, plant.draw(3, name))[0] - bare
@@ -131,6 +132,7 @@ def test_draws_repeat_and_stay_in_their_kind() -> None:
         assert repr(plant.draw_pair(seed)) == repr(plant.draw_pair(seed))
 
 
+@pytest.mark.study
 def test_a_dominant_effect_dominates() -> None:
     inputs = plant.designed_inputs(np.random.default_rng(0))
     effects = plant.draw_many(1, inputs).effects

@@ -67,6 +67,7 @@ def tip_of(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return end[:3], end[3:].reshape(3, 3)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     "force",
     [[(3.0, 0.0, 0.0)] * 2, [(4.0, 0.5, -1.0)] * 2, [(0.0, 0.0, -6.0), (3.0, -2.0, 1.0)]],
@@ -117,6 +118,7 @@ def test_the_jacobian_has_the_rotation_of_the_load() -> None:
         assert_allclose(found[:, k], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.study
 def test_in_motion_it_comes_to_rest_where_it_rests() -> None:
     """A load that begins suddenly, much damping."""
     robot = rod(density=0.3, damping_time=0.05)
@@ -130,6 +132,7 @@ def test_in_motion_it_comes_to_rest_where_it_rests() -> None:
     assert_allclose(state.tip_position, still.tip_position, atol=1e-7)
 
 
+@pytest.mark.study
 def test_a_step_has_second_order() -> None:
     """Of a load that grows: by how much the tip moves as the step is halved, and halved again."""
     robot = rod(density=0.3, damping_time=0.01)

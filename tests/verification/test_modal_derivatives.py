@@ -136,6 +136,7 @@ CASES = [
 ]
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(("modes", "n_pieces", "n_tendons"), CASES)
 def test_gradient_and_hessian_are_those_of_the_energy(
     modes: tuple[int, ...], n_pieces: int, n_tendons: int

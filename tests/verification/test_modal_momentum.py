@@ -84,6 +84,7 @@ def imbalance(base: Base, dt: float, scheme: str) -> np.ndarray:
     return np.concatenate([off[:3] / size[:3].max(), off[3:] / size[3:].max()])
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("scheme", ["bdf2", "generalized_alpha"])
 @pytest.mark.parametrize("base", [shaken, spun])
 def test_what_the_base_gives_is_the_change_of_momentum(base: Base, scheme: str) -> None:

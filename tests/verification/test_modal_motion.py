@@ -103,6 +103,7 @@ def ramp(sim: Simulator, n: int, force: float = 0.3) -> np.ndarray:
     return np.array(tips)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("scheme", ["bdf2", "generalized_alpha"])
 @pytest.mark.parametrize("story", [release, ramp])
 def test_it_is_second_order_in_time_after_a_sudden_load_too(story: Any, scheme: str) -> None:
@@ -155,6 +156,7 @@ def southwell(rate: float) -> float:
     return float(np.sqrt(eigh(stiffness, mass, eigvals_only=True)[0]) / (2.0 * math.pi))
 
 
+@pytest.mark.study
 def test_a_turning_cantilever_is_stiffer() -> None:
     """It lies along x and turns about z, up to speed within six periods; a force along z then lets go."""
     f0 = southwell(0.0)
@@ -197,6 +199,7 @@ def test_a_free_fall_of_the_base_is_weightless() -> None:
     assert_allclose(state.velocity[0, :, 2], -9.81 * 0.05, rtol=2e-3)
 
 
+@pytest.mark.study
 def test_two_threads_give_what_one_gives() -> None:
     """To the last bit, in a batch that does not divide evenly into chunks and threads."""
     n, robot = 6 * LANES + 3, replace(load_robot("prototype"), gravity=(0.0, 0.0, 0.0))
@@ -215,6 +218,7 @@ def test_two_threads_give_what_one_gives() -> None:
 
 
 # tendons hold this rod: its place is wrong by what the acceleration of BDF1 is, of the first order
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(("scheme", "order"), [("bdf1", 1), ("bdf2", 3), ("generalized_alpha", 3)])
 def test_the_error_of_a_step_is_reported(scheme: Any, order: int) -> None:
     robot = load_robot("prototype")

@@ -134,6 +134,7 @@ def test_inextensible_tendons_lock_the_twist_and_loose_ones_let_the_rod_go() -> 
     assert_allclose(loose.tip_position, free.tip_position, atol=1e-7)
 
 
+@pytest.mark.study
 def test_a_slack_tendon_carries_nothing() -> None:
     robot = one_sided(rod(), pretension=0.2)
     # pulled by one, the opposite one paid out far
@@ -157,6 +158,7 @@ def test_a_follower_force_keeps_its_place_on_the_tip() -> None:
     assert_allclose(state.base_wrench[0, :3], world, atol=1e-8)
 
 
+@pytest.mark.study
 def test_point_force_anywhere_matches_the_twin_and_keeps_the_order() -> None:
     lengths = bend(rod(), 0.7, 0.2)
     points = [(0.0313, (0.2, 0.1, 0.0)), (0.0521, (-0.1, 0.0, 0.3))]
@@ -171,6 +173,7 @@ def test_point_force_anywhere_matches_the_twin_and_keeps_the_order() -> None:
     assert error(24) < error(6) / 50.0  # fourth order: 256; a kink inside a step would leave first or second
 
 
+@pytest.mark.study
 def test_sampled_line_force_and_extension_match_the_twin() -> None:
     robot = load_robot("five_segment_reacher")
     robot = replace(robot, segments=robot.segments[3:])
@@ -216,6 +219,7 @@ def one_sided(robot: Robot, **changes: Any) -> Robot:
     return replace(robot, segments=tuple(segments))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("pull", [0.0, 3e-4, -1e-3])
 def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
     """Tendons that can only pull: pulled together, let go together, and at the edge where some hang loose."""
@@ -239,6 +243,7 @@ def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
             assert_allclose(state.tip_position[i], twin.tip_position, atol=1e-7)
 
 
+@pytest.mark.study
 def test_any_sampling_of_a_line_force_keeps_its_force_and_moment() -> None:
     rng = np.random.default_rng(6)
     for points in (2, 4, 7, 31, 200):

@@ -41,6 +41,7 @@ def log_and_robot() -> Any:
     return ethz_beam(DATA / "ethz_beam.csv", settled=None)
 
 
+@pytest.mark.study
 @needs_data
 @pytest.mark.parametrize("shear", [False, pytest.param(True, marks=TOO_SOFT)])
 @pytest.mark.parametrize("pair", REPEATS, ids=["alone", "loaded"])
@@ -49,6 +50,7 @@ def test_its_frequency_with_nothing_fitted(log_and_robot: Any, pair: tuple[str, 
     assert abs(found["frequency_error"]) <= 0.03
 
 
+@pytest.mark.study
 @needs_data
 @pytest.mark.parametrize("shear", [False, True])
 @pytest.mark.parametrize("pair", REPEATS, ids=["alone", "loaded"])

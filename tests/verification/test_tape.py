@@ -92,6 +92,7 @@ PARAMETERS = (
 )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("scheme", ["bdf1", "bdf2", "generalized_alpha"])
 def test_numbers_of_the_robot(scheme: str) -> None:
     robot = with_number(rod(), "gravity.1", 2.0)
@@ -112,6 +113,7 @@ def test_numbers_of_the_robot(scheme: str) -> None:
         assert_allclose(along, apart, rtol=1e-6)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("robot", [rod(), two()], ids=["one segment", "two segments"])
 def test_inputs_of_every_call(robot: Robot) -> None:
     n_calls, rng = 60, np.random.default_rng(2)

@@ -51,6 +51,7 @@ def test_a_settled_rod_is_in_balance_with_the_spring(stiffness: float) -> None:
     assert_allclose(again.tip_position, state.tip_position, atol=2e-10)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("stiffness", [5.0, 400.0])
 def test_steps_come_to_where_settle_is(stiffness: float) -> None:
     robot = tied(two_segments(), stiffness)
@@ -117,6 +118,7 @@ def test_a_log_is_a_simulator_settled_at_every_row(stiffness: float) -> None:
         assert_allclose(shown.tip_position[i], tip, atol=2e-8)
 
 
+@pytest.mark.study
 def test_a_released_tip_swings_as_its_spring_and_its_modes_say() -> None:
     """In motion the spring is a step behind: with small steps the rod rings faster by sqrt(1 + k C)."""
     heavy = rod("passive", line_density=0.05)

@@ -12,6 +12,7 @@ from fastrod_scenes.a1.quadruped import MOUNT, neck, standing
 from fastrod_scenes.scene import SceneError
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 def test_push_holds_at_other_time_steps(dt, monkeypatch):
     monkeypatch.setattr(push.NeckPush, "dt", dt)
@@ -21,6 +22,7 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
     assert figures["balance of the cube's momentum, N s"] < 1e-12
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("scene", "setting", "value", "sentence"),
     [

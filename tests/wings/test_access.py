@@ -88,6 +88,7 @@ STRANGERS = {
 }
 
 
+@pytest.mark.study(beyond=52)
 @pytest.mark.parametrize("how", ["page", "websocket"])
 @pytest.mark.parametrize("stranger", STRANGERS)
 def test_a_stranger_is_refused_in_a_sentence(address: str, stranger: str, how: str) -> None:

@@ -260,6 +260,7 @@ def test_the_base_may_move(world: Bullet, arm: BulletArm) -> None:
     assert_allclose(arm.frame(POSES["low"]) - before, [1, 0, 0, 0, 0, 0, 0], atol=1e-15)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("forward", [False, True])
 def test_motors_follow_a_circle(world: Bullet, arm: BulletArm, forward: bool) -> None:
     """Radius 0.2 m in 20 s, of which a quarter, a switching load of 20 N on the flange: 0.9 um off without

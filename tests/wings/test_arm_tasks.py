@@ -40,6 +40,7 @@ def single(opened):
     return lambda name, **options: opened(SingleEnv(name, threads=1, **options))
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "randomise", [None, {"bending_stiffness": (0.9, 1.1), "backlash.half_width": (0.0, 1e-5)}]
@@ -61,6 +62,7 @@ def test_an_environment_of_a_batch_is_the_single_one_of_its_seed(name, randomise
             break
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_baseline_solves_the_task(name, seed, single):
@@ -72,6 +74,7 @@ def test_the_baseline_solves_the_task(name, seed, single):
     assert not info["lost"]
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("action", ["rate", "displacement"])
 def test_random_actions_leave_numbers_finite_and_within_their_bounds(name, action, single):
@@ -93,6 +96,7 @@ def test_random_actions_leave_numbers_finite_and_within_their_bounds(name, actio
     assert n_lost == 0
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "options", [{"n_steps": 1}, {"n_steps": 1, "action": "displacement"}, {"observation": "goal"}]

@@ -99,6 +99,7 @@ def test_reward_is_its_formula_and_distance_the_least():
         least = np.where(terminated, np.linalg.norm(task.desired - task.tip, axis=1), least)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("action", ["rate", "displacement"])
 def test_baseline_catches(action):
     env, _ = begun(60, seed=100, action=action)

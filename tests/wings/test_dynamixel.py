@@ -115,6 +115,7 @@ def test_it_connects_moves_and_reads_back(bench):
     assert not emulator.drives.moving.any()
 
 
+@pytest.mark.study
 def test_homing_finds_the_tendons_taut(hardware):
     with started(hardware, camera=False, home=True) as (prototype, emulator):
         prototype.wait(0.05)

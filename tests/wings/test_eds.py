@@ -140,6 +140,7 @@ def test_a_file_is_read_however_it_is_written(drive, writing, tmp_path):
         assert var.pdo_mappable == fact.mappable or (writing == "ends early" and key == (0x6502, 0))
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("how", [{}, {"key": "ParameterValue", "node": "1"}], ids=["EDS", "DCF"])
 def test_a_drive_with_a_makers_file_connects_homes_and_moves(drive, how, write):
@@ -187,6 +188,7 @@ LACKED = {
 }
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("index", LACKED)
 @pytest.mark.parametrize("known", [True, False], ids=["by the file", "by the drive alone"])
 def test_what_a_drive_lacks_is_left_out_and_said(index, known, write):
@@ -208,6 +210,7 @@ def test_what_a_drive_lacks_is_left_out_and_said(index, known, write):
         assert not made.nodes.moving.any()
 
 
+@pytest.mark.study(beyond=8)
 @pytest.mark.parametrize(("index", "sub"), [key for key in NEEDED if key[1] < 2])
 def test_what_is_needed_is_demanded_by_name(index, sub, write):
     path = write(without(index))

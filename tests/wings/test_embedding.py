@@ -64,6 +64,7 @@ def embedded_step() -> Any:
     return found["embedded_step"]
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["an engine of one body", "pybullet", "mujoco"])
 def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()
@@ -72,6 +73,7 @@ def test_the_example_prints_its_output(code: str, output: str) -> None:
     assert printed.getvalue() == output
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", [0.003, 0.025])
 def test_rod_hangs_on_the_spring_with_its_weight_and_turns_it_with_its_moment(embedded_step, dt) -> None:
     # at rest: k z = -(m g + w), and the torsion spring holds the weight's moment about the centre of mass,
@@ -101,6 +103,7 @@ def test_impulse_of_the_tip_force_is_the_bodys_momentum(embedded_step) -> None:
     assert np.linalg.norm(body.spin) > 0.01  # and turns it
 
 
+@pytest.mark.study
 def test_bounce_keeps_its_energy(embedded_step) -> None:
     # straight up and down: 1/2 m v^2 + 1/2 k z^2 + w z is constant; semi-implicit Euler lets it swing by
     # omega dt / 2

@@ -28,6 +28,7 @@ def push(stage, dt, direction, gravity, duration=0.8, mass=MASS, place=None):
     return np.array(speeds), mass * s.velocity()[:3], dt * np.cumsum(forces, axis=0), ok
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("direction", ["axial", "side"])
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(stage, dt, direction):
@@ -40,6 +41,7 @@ def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(stage, dt, direction
     assert speeds.max() < (1.01 if direction == "axial" else 1.5) * SPEED
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("direction", ["axial", "side"])
 def test_cube_on_the_floor_follows_the_tip(stage, direction):
     # from the side the rod bends by some 3 cm until 20 g slide; 100 g would bend it as far as it is long
@@ -51,6 +53,7 @@ def test_cube_on_the_floor_follows_the_tip(stage, direction):
     assert -impulse[-1] @ DISPLACEMENT[direction] > 0.0
 
 
+@pytest.mark.study
 def test_push_against_friction_is_the_friction(stage):
     # once it slides the host holds mu N against the way; N is the weight, and what the tip's own friction
     # presses the cube down with
@@ -68,6 +71,7 @@ def test_light_and_heavy_cubes_are_not_launched(stage, mass):
     assert_allclose(momentum, -impulse[-1], atol=1e-9)
 
 
+@pytest.mark.study(beyond=1)
 def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
     place = [BEYOND, 0.03, 0.02]
     speeds, momentum, impulse, ok = push(stage, 0.005, "axial", gravity=0.0, duration=0.4, place=place)
@@ -76,6 +80,7 @@ def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
     assert_allclose(momentum, -impulse[-1], atol=1e-9)
 
 
+@pytest.mark.study
 def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage):
     mass, height = 0.02, 0.1
     cube = Cube(0.06, mass, [0.15, 0.0, height])
@@ -90,6 +95,7 @@ def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage):
     assert min(energy[-5:]) < 0.9 * max(energy)  # what it hit took some
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 def test_body_without_a_word_to_the_rod_gets_the_speed_of_the_capsule(stage, dt):
     beside = Cube(0.04, 0.1, [0.2, RADIUS + 0.001 + 0.02, 0.0])

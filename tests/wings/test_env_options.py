@@ -31,6 +31,7 @@ def made(opened):
     return lambda name, n=2, **options: opened(batch(name, n, **options))
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "options",
@@ -48,6 +49,7 @@ def test_every_task_knows_the_common_options(name, options, made):
     assert (terminated | truncated).all() == (options.get("n_steps") == 1 or terminated.all())
 
 
+@pytest.mark.study(beyond=8)
 @pytest.mark.parametrize("name", NAMES)
 def test_difficulty_is_a_number_from_zero_to_one(name, made):
     env = made(name, difficulty=0.0)
@@ -304,6 +306,7 @@ def test_meshes_are_closed_and_look_outward() -> None:
         assert enclosed == pytest.approx(volume, rel=0.02)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_of_every_environment(name, made):
     env = made(name, render_mode="rgb_array")

@@ -226,6 +226,7 @@ def test_reach_takes_a_robot_file(name: str, tmp_path: Path) -> None:
     assert "height" not in info["final_info"]["reward_terms"]
 
 
+@pytest.mark.study
 def test_reach_with_a_robot_file_is_a_gymnasium_environment(tmp_path: Path) -> None:
     robot = replace(fastrod.load_robot("tdcr_b"), effects=({"name": "backlash", "half_width": 1e-4},))
     fastrod.save_robot(robot, tmp_path / "mine.toml")

@@ -23,6 +23,7 @@ VARIED: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 def test_an_environment_does_not_know_its_neighbours(name, opened):
     hosted = task_class(name).hosted  # worlds of rigid bodies take their time
@@ -73,6 +74,7 @@ FORWARD = {"Catch": 0.0, "TubeInsert": (0.0, 0.0, 0.0, 0.0, 0.5), "QuadrupedPush
 """With this, random actions meet the wall or the cube."""
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(("name", "steps", "key", "options"), BESIDE)
 def test_a_seed_is_a_rollout_whatever_is_beside_it(name, steps, key, options, opened):
     """Bit for bit, with contacts, and through the ends of episodes."""
@@ -88,6 +90,7 @@ def test_a_seed_is_a_rollout_whatever_is_beside_it(name, steps, key, options, op
         assert beside[2].reported.max() > 0.0
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", ["Catch", "TubeInsert", "BoxExplore", "PickPlace", "DualArm"])
 def test_a_seed_is_a_rollout_whatever_came_before(name, opened):
     fresh, used = (opened(batch(name, 1 if task_class(name).hosted else 2)) for _ in range(2))

@@ -56,6 +56,7 @@ def test_names_are_ids() -> None:
         BatchEnv("Reech")
 
 
+@pytest.mark.study(beyond=5)
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_has_nothing_to_say(name, single):
     env = single(name)
@@ -63,6 +64,7 @@ def test_gymnasiums_checker_has_nothing_to_say(name, single):
     assert env.action_space.shape == (env.unwrapped.task.n_actions,)
 
 
+@pytest.mark.study(beyond=9)
 @pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines_checker_has_nothing_to_say(name, single):
     why = "stable-baselines3 is not installed: pip install 'fastrod[rl]'"
@@ -81,6 +83,7 @@ def test_a_task_says_what_it_is(name: str) -> None:
     assert kind.accuracy > 0.0
 
 
+@pytest.mark.study(beyond=9)
 def test_spaces_are_those_of_the_fields(batch: BatchEnv) -> None:
     task, space = batch.task, batch.single_observation_space
     assert_array_equal(batch.single_action_space.low, -1.0)
@@ -98,6 +101,7 @@ def test_spaces_are_those_of_the_fields(batch: BatchEnv) -> None:
     assert batch.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
 
+@pytest.mark.study(beyond=2)
 def test_a_step_brings_new_arrays_within_the_spaces(batch: BatchEnv) -> None:
     observation, info = batch.reset(seed=3)
     assert info == {}
@@ -124,6 +128,7 @@ def test_a_step_brings_new_arrays_within_the_spaces(batch: BatchEnv) -> None:
         assert_allclose(sum(terms), reward, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.study(beyond=2)
 def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
     batch.reset(seed=5)
     total, steps, ends = np.zeros(3), np.zeros(3, int), np.zeros(3, int)
@@ -181,6 +186,7 @@ def test_only_masked_environments_begin_anew() -> None:
             env.reset(options={"reset_mask": np.array(mask)})
 
 
+@pytest.mark.study(beyond=2)
 def test_what_is_not_finite_is_refused_and_nothing_happens(batch: BatchEnv) -> None:
     actions = drawn(batch, 2, seed=4)
     batch.reset(seed=7)
@@ -224,6 +230,7 @@ def test_no_step_before_a_reset(name, opened):
         env.step(np.zeros(env.action_space.shape))
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_breaks_under_random_actions(name, opened):
     env = opened(several(name, 2))
@@ -249,6 +256,7 @@ BOUNDS = [
 ]
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(("name", "n", "steps", "options"), BOUNDS)
 def test_random_actions_stay_within_the_bounds(name, n, steps, options, opened):
     env, goal = opened(several(name, n, **options)), "observation" in options

@@ -60,6 +60,7 @@ def test_correlation_is_of_axes_on_which_goals_differ() -> None:
     assert np.isnan(r[2])
 
 
+@pytest.mark.study
 def test_table_and_files(tmp_path: Path) -> None:
     result = evaluate("Track", None, episodes=2, options={"n_steps": 40})
     console = Console(width=140, record=True, file=io.StringIO())

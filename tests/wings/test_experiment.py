@@ -96,6 +96,7 @@ def circle_plan() -> InversePlan:
 # ---------------------------------------------------------------- excite
 
 
+@pytest.mark.study
 def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path: Path) -> None:
     hands, run, reported = Noting(bench), short_run(), []
     log = excite(
@@ -126,6 +127,7 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path:
     assert (np.diff([done for _, done, _ in reported]) >= 0).all()
 
 
+@pytest.mark.study
 def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -> None:
     run = short_run()
     log = excite(bench.prototype, run, bench.assistant, tmp_path / "run.csv")
@@ -140,6 +142,7 @@ def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -
     assert np.sqrt(np.mean((state.tip_position - log.tip_position[free]) ** 2)) < 1e-3
 
 
+@pytest.mark.study
 def test_what_is_returned_is_what_is_on_disk(bench: EmulatedBench, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     log = excite(bench.prototype, short_run(), bench.assistant, path)
@@ -165,6 +168,7 @@ def test_a_stop_half_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) ->
 # ---------------------------------------------------------------- follow
 
 
+@pytest.mark.study
 def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
     from fastrod_envs.policies import Policy, find

@@ -168,6 +168,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
 ONCE = ("following error", "clock jump")  # nothing tells that they are still there
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("moment", [0.75, 1.32])
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(
@@ -201,6 +202,7 @@ def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(
         assert len(rig.recorder.stop().t) == rows
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> None:
     inject, _ = FAULTS[name]
@@ -343,6 +345,7 @@ with Prototype(hardware, sys.argv[1], Still()) as prototype:
 """
 
 
+@pytest.mark.study
 @pytest.mark.real_time
 def test_a_killed_process_leaves_its_drives_stopped_and_its_rows_on_disk(tmp_path: Path) -> None:
     bus, log = "udp_multicast:239.74.163.7:43183", tmp_path / "log.csv"

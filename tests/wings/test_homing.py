@@ -149,6 +149,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_while_the_tendons_move_stops_all_at_once_and_is_named(name, rig, monkeypatch):
     inject, sentence = FAULTS[name]
@@ -177,6 +178,7 @@ def test_a_fault_while_the_tendons_move_stops_all_at_once_and_is_named(name, rig
     np.testing.assert_array_equal(rig.nodes.true_pulled, where)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("phase", ["_tightened", "_straightened"])
 @pytest.mark.parametrize("drive", [0, 1, 2, 3])
 def test_a_blocked_drive_is_the_one_that_is_blamed(drive, phase, rig, monkeypatch):
@@ -196,6 +198,7 @@ def test_a_blocked_drive_is_the_one_that_is_blamed(drive, phase, rig, monkeypatc
     assert rig.bus.stop_reason == "homing did not end"
 
 
+@pytest.mark.study
 def test_a_camera_that_stands_elsewhere_pulls_no_tendon(rig):
     rig.moved = lambda position: position + np.array([0.025, 0.0, 0.0])
     beside = "the tip is seen 25 mm beside the axis; .* 1 mm at most; .*`fastrod drive register`"
@@ -207,6 +210,7 @@ def test_a_camera_that_stands_elsewhere_pulls_no_tendon(rig):
     assert np.abs(bending[:2] - bending[2:]).max() < 2e-4  # m: where tension alone had left it
 
 
+@pytest.mark.study
 def test_a_camera_that_turns_left_into_right_is_found_in_the_second_round(rig):
     rig.moved = lambda position: position * (-1.0, -1.0, 1.0) - (1e-3, 0.0, 0.0)
     with pytest.raises(DeviceError, match=r"mm before did not bring it nearer; is the camera registered\?"):
@@ -214,6 +218,7 @@ def test_a_camera_that_turns_left_into_right_is_found_in_the_second_round(rig):
     assert rig.bus.stop_reason == "homing did not end"
 
 
+@pytest.mark.study
 def test_a_marker_that_is_not_seen_stops_the_drives_too(rig):
     rig.emulator.hidden = True
     with pytest.raises(DeviceError, match=r"saw the marker 0 times"):
@@ -222,6 +227,7 @@ def test_a_marker_that_is_not_seen_stops_the_drives_too(rig):
     assert rig.nodes.states == ("quick stop active",) * 4
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("camera", [True, False])
 def test_the_tensions_are_those_where_zero_is(camera, rig):
     transmission, robot = rig.home(camera=camera)

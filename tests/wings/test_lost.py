@@ -13,6 +13,7 @@ from fastrod_envs.single import SingleEnv
 LIGHT, HEAVY = {"gravity.line_density": (0.05, 0.051)}, {"gravity.line_density": (0.1, 0.101)}
 
 
+@pytest.mark.study(beyond=7)
 @pytest.mark.parametrize(
     ("task", "seed", "randomise"),
     [
@@ -36,6 +37,7 @@ def test_an_episode_of_the_shipped_policy_is_not_lost(task: str, seed: int, rand
     env.close()
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("task", NAMES)
 def test_random_steps_lose_no_robot_that_settles(task: str) -> None:
     needed(task)

@@ -190,6 +190,7 @@ def test_contacts_of_the_capsules_are_read_back():
     assert (np.abs(rod.wrench) < 1e-9).all()  # the rod itself knows nothing of it
 
 
+@pytest.mark.study
 def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
     # k C is far above 1 here: the force taken over at once would throw the rod from side to side
     rod, model, data = stand(SLIDING, feel=True)

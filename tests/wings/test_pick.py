@@ -12,6 +12,7 @@ from fastrod_scenes.ur5.pick import PickGripper, PickSuction
 from fastrod_scenes.ur5.picking import Cube, Picking
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("scene", "seed"), [(PickSuction, 1), (PickGripper, 2), (PickGripper, 3)])
 def test_any_cube_ends_on_the_spot(scene: type[PickSuction | PickGripper], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -32,6 +33,7 @@ def pull(stage: Picking) -> float:
     return float(sum(p[9] * p[7][2] + p[10] * p[11][2] + p[12] * p[13][2] for p in points))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("scene", [PickSuction, PickGripper])
 def test_the_held_cube_has_its_weight(scene: type[PickSuction | PickGripper]) -> None:
     """What holds it up is m (g + a), a by differences of its velocity; its mass is the given one."""
@@ -59,6 +61,7 @@ def test_without_suction_nothing_is_lifted(monkeypatch: pytest.MonkeyPatch) -> N
         PickSuction().check()
 
 
+@pytest.mark.study
 def test_a_slippery_cube_is_dropped() -> None:
     sentence = r"^scene pick_gripper: at \d\.\d+ s the cube is 0\.00\d+ m from where it was held"
     with pytest.raises(SceneError, match=sentence):

@@ -155,6 +155,7 @@ def folder(tmp_path: Path, demo: RunLog) -> Path:
     return tmp_path
 
 
+@pytest.mark.study
 def test_an_identification_beside_the_log_is_found(folder: Path, demo: RunLog) -> None:
     made = load(folder / "wobble.csv", frames=20)
     assert made.after.robot == with_(MEMORY, MARKER)
@@ -202,6 +203,7 @@ def test_a_wrong_robot_and_a_blind_log_are_said_in_a_sentence(folder: Path, demo
         Playback.of(replace(demo, tip_position=np.full((len(demo), 3), np.nan)), ROBOT)
 
 
+@pytest.mark.study
 def test_identify_shows_before_and_after(demo: RunLog) -> None:
     slop = with_({"name": "drum_gain", "gain": 0.08})
     few = demo.rows(slice(0, 900))

@@ -114,6 +114,7 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
 # what it refuses
 
 
+@pytest.mark.study(beyond=5)
 @pytest.mark.parametrize(
     ("reported", "words"),
     [
@@ -199,6 +200,7 @@ def test_a_recording_that_cannot_go_on_stops_the_drives_in_stepped_time_too(tmp_
 # starting and ending
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("effect", ["none", "friction"])
 def test_homing_finds_where_the_robot_is_straight(effect: str) -> None:
     with emulated(HARDWARE, seed=2, effect=effect) as made:
@@ -277,6 +279,7 @@ def _until(true: Any, seconds: float = 20.0) -> bool:
     return bool(true())
 
 
+@pytest.mark.study
 @pytest.mark.real_time
 def test_a_story_in_real_time(tmp_path: Any) -> None:
     before = threading.active_count()
@@ -405,6 +408,7 @@ def test_hands_may_cover_the_marker_while_it_rests() -> None:
         assert robot.sighting.ok
 
 
+@pytest.mark.study
 def test_a_marker_that_stays_covered_stops_the_robot() -> None:
     with bench() as (robot, emulator):
         robot.wait(0.5)

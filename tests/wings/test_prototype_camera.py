@@ -91,6 +91,7 @@ class Future(Attack):
         return replace(frame, t=frame.t + 1e3) if self.n == 1 else frame
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("recorded", [True, False])
 @pytest.mark.parametrize(
     ("attack", "flag", "goes_on"),

@@ -92,6 +92,7 @@ def session() -> Iterator[Callable[..., Session]]:
         one.close()
 
 
+@pytest.mark.study
 def test_a_cantilever_let_go_rings_at_its_closed_form() -> None:
     world, teleop = begun(elastic(), dt=2e-3)
     assert world.ringing.frequency == pytest.approx(FREQUENCY, rel=2e-3)
@@ -102,6 +103,7 @@ def test_a_cantilever_let_go_rings_at_its_closed_form() -> None:
     assert np.ptp(seen) > 0.06 * LENGTH
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["prototype", "tdcr_b", "ethz_beam"])
 def test_a_shipped_robot_rings_at_its_natural_frequency(name: str) -> None:
     robot = fastrod.load_robot(name)
@@ -115,6 +117,7 @@ def test_a_shipped_robot_rings_at_its_natural_frequency(name: str) -> None:
     assert frequency_of(seen, world.dt) == pytest.approx(natural, rel=0.03)
 
 
+@pytest.mark.study
 def test_a_drag_is_a_spring_that_gives_way() -> None:
     world, teleop = begun(elastic(damping_time=5e-3), dt=5e-3)
     start, small = tip(world), 0.01 * LENGTH
@@ -130,6 +133,7 @@ def test_a_drag_is_a_spring_that_gives_way() -> None:
     assert np.linalg.norm(teleop.step(world.dt).tip_force) == pytest.approx(farthest, rel=1e-6)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", [2e-3, 1e-2, 0.03])
 def test_a_held_rod_calms_down_and_a_released_one_gains_nothing(dt: float) -> None:
     world, teleop = begun(elastic(), dt=dt)
@@ -160,6 +164,7 @@ def test_drives_go_on_while_the_tip_is_let_go() -> None:
     assert teleop.bent(0)[0] == pytest.approx(0.3)
 
 
+@pytest.mark.study
 def test_it_rests_when_it_is_still_and_not_at_a_turning_point() -> None:
     world, teleop = begun(elastic(damping_time=5e-3), dt=5e-3)
     assert energies(world)[0] == 0.0
@@ -179,6 +184,7 @@ def test_it_rests_when_it_is_still_and_not_at_a_turning_point() -> None:
     assert not world.ringing.rests
 
 
+@pytest.mark.study
 def test_a_session_goes_on_until_it_rests(session: Callable[..., Session]) -> None:
     world, teleop = begun(elastic(damping_time=0.02), dt=2e-3)
     one = session(world, teleop)
@@ -201,6 +207,7 @@ def test_a_session_goes_on_until_it_rests(session: Callable[..., Session]) -> No
     assert energies(world)[0] < 1e-9
 
 
+@pytest.mark.study
 def test_without_damping_it_goes_on(session: Callable[..., Session]) -> None:
     world, teleop = begun(elastic(), dt=5e-3)
     pulled(world, teleop, 0.1)
@@ -212,6 +219,7 @@ def test_without_damping_it_goes_on(session: Callable[..., Session]) -> None:
     assert sum(energies(world)) > 0.9 * stored
 
 
+@pytest.mark.study
 def test_pause_holds_it_in_the_air(session: Callable[..., Session]) -> None:
     world, teleop = begun(elastic(), dt=5e-3)
     pulled(world, teleop, 0.1)
@@ -234,6 +242,7 @@ def test_pause_holds_it_in_the_air(session: Callable[..., Session]) -> None:
     assert sum(energies(world)) == pytest.approx(sum(before), rel=0.05)
 
 
+@pytest.mark.study
 @pytest.mark.real_time
 def test_slow_motion_slows_it(session: Callable[..., Session]) -> None:
     world, teleop = begun(elastic(), dt=5e-3)
@@ -291,6 +300,7 @@ def test_a_machine_that_is_too_slow_says_so_and_keeps_its_pictures(
     assert np.median(np.diff([at for at, _ in frames])) < 0.1  # not a quarter of a second's steps at once
 
 
+@pytest.mark.study
 def test_many_ring_alike_and_a_reset_begins_at_rest() -> None:
     world = FreeWorld(elastic(), 3, 5e-3, dynamics=True)
     teleop = Teleop(world)

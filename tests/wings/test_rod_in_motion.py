@@ -63,6 +63,7 @@ def exchanged(dt: float, ratio: float) -> tuple[float, Floats]:
     return float(np.max(left) / size), np.array(velocities)
 
 
+@pytest.mark.study
 def test_a_free_body_and_its_rod_keep_their_momentum() -> None:
     """To the step by which the body is late: first order."""
     coarse, fine = (exchanged(dt, 20.0)[0] for dt in (1e-3, 2.5e-4))

@@ -12,6 +12,7 @@ from fastrod_scenes.contact.wall import Wall
 from fastrod_scenes.scene import RodScene, SceneError
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", names())
 def test_scene_keeps_to_its_physics(name):
     figures = load(name).check()
@@ -31,6 +32,7 @@ def test_scene_says_what_it_is(name):
         assert scene.simulator().dt == scene.dt
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["draped", "pair", "wall"])
 def test_run_is_ok_from_the_first_input_to_the_last(name):
     scene = load(name)

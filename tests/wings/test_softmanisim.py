@@ -77,6 +77,7 @@ def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make):
     assert_allclose(sim.calc_tip_pos([0.05, 0, 0])[0], [0, 0.15, 0], atol=1e-6)
 
 
+@pytest.mark.study
 def test_orientations_are_those_of_the_backbone(make):
     """z of each quaternion is the tangent, by central differences; the bend is displacement over offset."""
     sim = make(number_of_sphere=200)
@@ -152,6 +153,7 @@ def test_a_world_of_its_own_ends_with_it() -> None:
     assert not sim.bullet.isConnected()
 
 
+@pytest.mark.study
 def test_robots_and_worlds_do_not_disturb_each_other(make):
     alone, here, there = make(), make(), make()
     beside = SoftManiSim(here.bullet, number_of_segment=1)  # a second robot in the same world
@@ -187,6 +189,7 @@ def test_the_marker_is_only_seen(make):
 # pushing
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("dt", STEPS)
 def test_a_cube_takes_the_speed_of_what_pushes_it(make, dt):
     """The head may begin one step's way inside: the engine takes out a fifth of it a step, as speed."""
@@ -202,6 +205,7 @@ def test_a_cube_takes_the_speed_of_what_pushes_it(make, dt):
     assert_allclose(np.array(seen)[:, [0, 2]], 0.0, atol=1e-9)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", STEPS)
 def test_a_swinging_head_pushes_at_its_speed(make, dt):
     sim = make(dt=dt, gravity=0.0, max_grasp_width=0.0)
@@ -217,6 +221,7 @@ def test_a_swinging_head_pushes_at_its_speed(make, dt):
     assert np.linalg.norm(cubes, axis=1).max() == pytest.approx(speed.max(), rel=0.1)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", STEPS)
 def test_a_jump_of_the_action_launches_nothing(make, dt):
     sim = make(dt=dt, gravity=0.0, number_of_sphere=16)
@@ -315,6 +320,7 @@ def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(make, caplog):
     assert sim.is_tip_in_contact(cube)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("dt", STEPS)
 def test_the_gripper_holds_what_it_closes_on(make, dt):
     """A cube of 3 cm and 100 g, not quite in the middle: lifted by 10 cm, held for a second, and dropped."""

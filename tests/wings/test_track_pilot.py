@@ -84,6 +84,7 @@ def follow(pilot: PolicyDriver, robot: Robot, n_steps: int = 120) -> dict[str, A
     return found
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("robot", [PROTOTYPE, WORN], ids=["bare", "worn"])
 @pytest.mark.parametrize(("path", "seed"), [("triangle", 1), ("square", 2), ("circle", 4)])
 def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -> None:
@@ -97,6 +98,7 @@ def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -
     assert here["distance"] < 1e-3
 
 
+@pytest.mark.study
 def test_both_ways_round_were_seen() -> None:
     senses = {
         episode(path, seed, PROTOTYPE, n_steps=1)["sense"]
@@ -105,6 +107,7 @@ def test_both_ways_round_were_seen() -> None:
     assert senses == {-1, 1}
 
 
+@pytest.mark.study
 def test_a_simulated_robot_is_led_along_the_path() -> None:
     now = [0.0]
     link = SimulatedRobot(PROTOTYPE, dt=DT, clock=lambda: now[0])
@@ -122,6 +125,7 @@ def test_a_simulated_robot_is_led_along_the_path() -> None:
     assert np.mean(off) < 5e-4
 
 
+@pytest.mark.study
 def test_a_path_of_ones_own_is_the_tasks_where_it_is_the_same() -> None:
     own = circle(radius=0.02, period=9.0, center=(0.0, 0.0, PROTOTYPE.length))
     one, other = (follow(PolicyDriver(policy(), path), PROTOTYPE, 20) for path in ("circle", own))
@@ -146,6 +150,7 @@ def test_between_steps_the_command_stays() -> None:
     assert np.abs(wanted).max() > 1e-4
 
 
+@pytest.mark.study
 def test_a_dropout_is_the_last_known_tip_for_one_step_and_then_a_halt() -> None:
     known = np.array([0.002, -0.001, 0.069])
     lost = np.full(3, np.nan)
@@ -212,6 +217,7 @@ def test_what_cannot_be_piloted_is_said(make: Any, error: type[Exception], sente
         make()
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("tip", "t", "sentence"),
     [

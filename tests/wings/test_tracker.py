@@ -132,6 +132,7 @@ def test_eye_repeats_by_its_seed():
     assert (first.astype(float) - clean).std() == pytest.approx(2.0, rel=0.05)
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["straight", "bent"])
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0])
 def test_clean_pictures_have_no_bias(camera, tilt):
@@ -152,6 +153,7 @@ def test_clean_pictures_have_no_bias(camera, tilt):
     assert np.abs(moved)[:, 2].max() < 2e-4
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("distance", "largest"), [(0.10, 0.2e-3), (0.20, 0.9e-3), (0.40, 3e-3)])
 def test_error_of_noisy_pictures(distance, largest):
     rng = np.random.default_rng(2)
@@ -263,6 +265,7 @@ def test_the_workspace_is_the_robots(robot, position, expected, flag):
     assert workspace.refusal(np.array(position), None if expected is None else np.array(expected)) == flag
 
 
+@pytest.mark.study
 def test_no_curve_that_bends_within_the_limit_is_outside_the_workspace():
     rng = np.random.default_rng(0)
     for robot, bent in ((ROBOT, 32.0), (CURVED, 72.0), (LIMP, 200.0)):

@@ -93,6 +93,7 @@ def test_components_add_up_to_the_displacement():
     assert run.soft_fraction(0.0) > LEAST_FRACTION
 
 
+@pytest.mark.study
 def test_soft_robot_alone_tracks_the_full_circle_and_the_held_arm_stays():
     run = follow(load("track_circle").path(), 8.0, movers="soft", depth=0.07)
     assert run.mean_square(APPROACH) < LARGEST_ERROR
@@ -109,6 +110,7 @@ def test_arm_alone_leaves_the_soft_robot_straight():
     assert not run.by_soft.any()
 
 
+@pytest.mark.study
 def test_square_as_large_as_the_papers_is_beyond_the_soft_robot_alone():
     run = follow(load("track_square").path(), 5.4, movers="soft", depth=0.05)
     assert run.mean_square(2.0, 3.0) < LARGEST_ERROR  # the middle of a side

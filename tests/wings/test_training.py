@@ -44,6 +44,7 @@ def short_plan(steps: int) -> Any:
     return make_plan("Reach", steps=steps, n_envs=16, options={"n_steps": 10}, settings=SHORT)
 
 
+@pytest.mark.study
 def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None:
     options, settings, run = {"n_steps": 20}, {"n_epochs": 2}, tmp_path / "run"
     plan = make_plan("Reach", steps=2560, n_envs=32, seed=3, options=options, settings=settings)
@@ -72,6 +73,7 @@ def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None
     assert [layer.out_features for layer in layers if hasattr(layer, "out_features")] == [256, 256]
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
 def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, algorithm: str) -> None:
     run, replays = tmp_path / "run", {"learning_starts": 100, "batch_size": 64, "gradient_steps": 1}
@@ -140,6 +142,7 @@ def test_a_damaged_checkpoint_is_refused_in_a_sentence(tmp_path: Path) -> None:
     assert read_config(run)[1]["steps_done"] == 320
 
 
+@pytest.mark.study
 def test_lessons_bring_the_policy_to_the_baseline() -> None:
     env = BatchEnv("Reach", num_envs=32, n_steps=20)
     plan = make_plan("Reach", n_envs=32, options={"n_steps": 20})

@@ -5,6 +5,7 @@ import pytest
 from two_engines import CASES, apart, at_rest, carried
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("case", ["hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block"])
 def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
     assert case in CASES

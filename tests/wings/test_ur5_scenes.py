@@ -98,6 +98,7 @@ def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
     world.disconnect()
 
 
+@pytest.mark.study(beyond=7)
 @pytest.mark.parametrize("seed", range(10))
 def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed, opened):
     stage = opened(Exploration(Box(), seed, Explore.dt))
@@ -137,6 +138,7 @@ def test_held_joints_stay_while_the_soft_robot_looks_around(opened):
     assert stage.seen(0)[0] > 100
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("box", "sentence"),
     [

@@ -137,6 +137,7 @@ def test_a_link_goes_with_its_own_model(tmp_path: Path) -> None:
         app.open(FreeWorld(load_robot("tdcr_a")), link=SimulatedRobot(load_robot("prototype")))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> None:
     with socket.socket() as probe:

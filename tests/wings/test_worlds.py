@@ -59,6 +59,7 @@ def rest(world, command, steps=8):
     return tip(world)
 
 
+@pytest.mark.study(beyond=5)
 @pytest.mark.parametrize("name", [*robot_names(), *ROD_SCENES, *HOSTED, *MUJOCO_SCENES])
 def test_world_plays_and_obeys(name, shown):
     world = shown(name)
@@ -114,6 +115,7 @@ def test_script_begins_again_after_its_end():
     assert_allclose(tip(world), first, atol=1e-12)
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize(
     "robot",
     [*map(load_robot, robot_names()), *map(heavy, ("tendon_length", "passive", "tendon_tension"))],
@@ -281,6 +283,7 @@ def test_tracking_jacobian_against_the_model(shown):
     assert_allclose(world.jacobian()[:, 6:], jacobian[:, 6:], atol=1e-2 * np.abs(jacobian).max())
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["track_circle", "explore", "dual_arm"])
 def test_command_moves_the_flange(name, shown):
     world = shown(name)

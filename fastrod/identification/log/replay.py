@@ -13,6 +13,7 @@ from fastrod.errors import InputError, LogError
 from fastrod.identification.log.inputs import base_of, inputs
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
+from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats, Ints
 
 Progress = Callable[[int, int], None]
@@ -104,6 +105,7 @@ class Replay:
         )
 
 
+@one_blas_thread
 def replay(
     log: RunLog,
     robot: Robot,

@@ -31,8 +31,8 @@ from ..vec import dot
 from .bvh import Numbers, Record
 from .centreline import curve_of, interval_of, point_at
 from .contact_set import ContactRules, add_walls, choose, force_of, merge, pressed_only, stands, violation
-from .problem import ContactWorld, damping_of, rod_search, thread_problem
-from .proximity import ProximityOptions, ProximitySearch, search_obstacles, thread_search_work
+from .problem import ContactWorld, damping_of, rod_search, task_problem
+from .proximity import ProximityOptions, ProximitySearch, search_obstacles, task_search_work
 from .rod_proximity import search_rods
 from .solve import solve_contacts
 from .tunnelling import face_entered_sides, moved_far, tunnelled
@@ -89,7 +89,8 @@ def _search_of(
 
 @kernel
 def search_robots(
-    thread: int,
+    task: int,
+    n_tasks: int,
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -98,10 +99,10 @@ def search_robots(
     n_found: Ints,
     work: SearchWork,
 ) -> None:
-    """Candidates of every n-th of these robots, as the thread of this number of n, and its smallest gap into
-    `motion`; -1 candidates where it has gone through an obstacle since the last step."""
-    own = thread_search_work(work, thread)
-    for r in range(thread, len(rows), len(work.known)):
+    """Candidates of every n-th of these robots, as this task of n, and its smallest gap into `motion`; -1
+    candidates where it has gone through an obstacle since the last step."""
+    own = task_search_work(work, task)
+    for r in range(task, len(rows), n_tasks):
         i = rows[r]
         far = motion.tracked[i] and moved_far(i, motion)
         if far and tunnelled(i, motion, rods.first[i], surfaces, own.stack)[0] >= 0:
@@ -305,11 +306,11 @@ def _iterate_world(world: ContactWorld, rows: ContactRows, problem: ContactProbl
 
 
 @kernel
-def iterate_worlds(thread: int, batch: ContactIteration) -> None:
-    """One contact iteration of every n-th world, as the thread of this number of n."""
-    rows, problem = batch.rows, thread_problem(batch.problem, thread)
-    work = thread_search_work(batch.search, thread)
-    for k in range(thread, len(rows.start) - 1, len(batch.problem.first_point)):
+def iterate_worlds(task: int, n_tasks: int, batch: ContactIteration) -> None:
+    """One contact iteration of every n-th world, as this task of n."""
+    rows, problem = batch.rows, task_problem(batch.problem, task)
+    work = task_search_work(batch.search, task)
+    for k in range(task, len(rows.start) - 1, n_tasks):
         world = ContactWorld(
             rows.start[k],
             rows.start[k + 1],

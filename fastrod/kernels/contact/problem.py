@@ -85,7 +85,7 @@ def contact_problem(n_threads: int, n_rows: int, n_loads: int, n_x: int, max_con
 
 
 @inline
-def thread_problem(problem: ContactProblem, i: int) -> ContactProblem:
+def task_problem(problem: ContactProblem, i: int) -> ContactProblem:
     """The room of one thread."""
     return ContactProblem(
         problem.first_point[i],

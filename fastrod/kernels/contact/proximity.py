@@ -84,7 +84,7 @@ def search_work(n_threads: int, n_points: int) -> SearchWork:
 
 
 @inline
-def thread_search_work(work: SearchWork, i: int) -> SearchWork:
+def task_search_work(work: SearchWork, i: int) -> SearchWork:
     """The room of one thread."""
     return SearchWork(work.known[i], work.least[i], work.phi[i], work.slope[i], work.sample[i], work.stack[i])
 
