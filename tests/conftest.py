@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numba
 import pytest
-from cost import Cost
+from cost import Cost, Once
 from rods import Table
 from truthfiles import rows
 
@@ -20,7 +20,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.pluginmanager.register(Cost(config), "cost")
+    config.pluginmanager.register(Cost(config, Once()), "cost")
 
 
 # commands that tests run compile at any time, and their stderr is read

@@ -2,11 +2,12 @@
 
 `@pytest.mark.study` marks a function that is too dear for every check, `@pytest.mark.study(beyond=n)` all its
 cases but the first n. A function that is not marked and costs more than `MOST`, all its cases together, fails
-the run. CPU time is counted, so that a busy machine does not matter, and compiling is not.
+the run. CPU time is counted, so that a busy machine does not matter; compiling and importing are not.
 """
 
 from __future__ import annotations
 
+import builtins
 import json
 import os
 import resource
@@ -31,13 +32,17 @@ def cpu_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
-class _Compiling(event.Listener):
-    """CPU seconds that numba spent in this process."""
+class Once(event.Listener):
+    """CPU seconds of what a process does once, whichever test comes first: compiling and importing."""
 
     def __init__(self) -> None:
         self.spent, self._depth, self._begun = 0.0, 0, 0.0
+        self._import = builtins.__import__
+        builtins.__import__ = self._imported
+        event.register("numba:compile", self)
 
     def on_start(self, what: Any) -> None:
+        """Of the outermost import or compilation."""
         if self._depth == 0:
             self._begun = cpu_seconds()
         self._depth += 1
@@ -47,15 +52,21 @@ class _Compiling(event.Listener):
         if self._depth == 0:
             self.spent += cpu_seconds() - self._begun
 
+    def _imported(self, *given: Any, **named: Any) -> Any:
+        self.on_start(None)
+        try:
+            return self._import(*given, **named)
+        finally:
+            self.on_end(None)
+
 
 class Cost:
     """The plugin. Which cases are studies is decided where they are collected; what they cost is measured
     where they run, and summed up in the process that reports."""
 
-    def __init__(self, config: pytest.Config) -> None:
-        self._config, self._compiling, self._begun = config, _Compiling(), 0.0
+    def __init__(self, config: pytest.Config, once: Once) -> None:
+        self._config, self._once, self._begun = config, once, 0.0
         self.spent: Counter[str] = Counter()
-        event.register("numba:compile", self._compiling)
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -73,7 +84,7 @@ class Cost:
             self._config.hook.pytest_deselected(items=left_out)
 
     def _now(self) -> float:
-        return cpu_seconds() - self._compiling.spent
+        return cpu_seconds() - self._once.spent
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_logstart(self) -> None:

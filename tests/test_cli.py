@@ -354,6 +354,7 @@ def test_demo_names_what_was_sealed_into_its_emulator(demo: tuple[Path, str]) ->
     assert "the run beside both models, in a browser: fastrod view" in printed
 
 
+@pytest.mark.study
 def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:
     out, printed = demo
     for name in ("report.json", "report.html", "identified.toml", "loop.json", "tracking.png"):
@@ -369,6 +370,7 @@ def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:
     assert read_log(out / "excite.csv", found).measured.mean() > 0.98
 
 
+@pytest.mark.study
 def test_tracking_is_nearer_to_the_path_with_what_was_found(demo: tuple[Path, str]) -> None:
     out, _ = demo
     loop = json.loads((out / "loop.json").read_text())

@@ -67,6 +67,7 @@ def test_a_finer_setting_is_nearer_to_the_reference(name: str, rungs: slice) -> 
     assert found[-1] < 2e-3
 
 
+@pytest.mark.study
 def test_a_chain_of_links_goes_to_the_reference_at_second_order() -> None:
     chain = peer("MuJoCo chain, hinges")
     links = [int(rung.label.split()[0]) for rung in chain.rungs[2:5]]

@@ -123,6 +123,7 @@ def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     assert [stage["name"] for stage in made["path"]] == ["base", "backlash"]
 
 
+@pytest.mark.study
 def test_json_holds_plain_values_and_null_for_what_is_no_number(result: Result) -> None:
     def check(value: Any) -> None:
         assert type(value) in (dict, list, str, int, float, bool, type(None)), value
@@ -185,6 +186,7 @@ def test_page_is_one_offline_file(html: str) -> None:
     assert inside <= set(read.ids)  # no figure took another one's names
 
 
+@pytest.mark.study
 def test_page_says_verdict_effects_and_what_to_run(result: Result, html: str) -> None:
     words = Reader(html).words
     assert all(sentence in words for sentence in re.split(r"(?<=\.) (?=[A-Z])", result.summary))
@@ -252,6 +254,7 @@ def test_identified_robot_loads_and_simulates(result: Result, tmp_path: Path) ->
     assert np.isfinite(state.tip_position).all()
 
 
+@pytest.mark.study
 def test_terminal_table_fits_80_columns(result: Result) -> None:
     from rich.console import Console
 
@@ -269,6 +272,7 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
         assert word in text, word
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", effect_names())
 def test_every_effect_has_a_signal(result: Result, name: str) -> None:
     value = Estimate(value=1.0, stderr=0.1, unit="", identifiable=True)
@@ -277,6 +281,7 @@ def test_every_effect_has_a_signal(result: Result, name: str) -> None:
     assert np.isfinite([view.signal, view.before, view.after]).all()
 
 
+@pytest.mark.study
 def test_backlash_is_drawn_as_loops_that_close(result: Result) -> None:
     view = Signals(result).view(result.effects[0])
     assert view.connected

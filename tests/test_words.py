@@ -119,7 +119,7 @@ def words_of(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
 
 
-@pytest.mark.study(beyond=64)
+@pytest.mark.study
 @pytest.mark.parametrize("file", sources(*PACKAGES), ids=lambda file: str(file.relative_to(ROOT)))
 def test_no_identifier_has_a_word_that_is_gone(file: Path) -> None:
     allowed = ALLOWED.get(file.relative_to(ROOT).as_posix(), "").split()

@@ -63,6 +63,7 @@ def test_the_base_model_that_bounds_are_made_of_has_one_weight() -> None:
     assert np.nanmedian(ratio) > 1.5
 
 
+@pytest.mark.study
 def test_the_share_above_the_noise_is_that_of_what_is_left() -> None:
     result = found("bump")
     assert result.verdict == "not_in_library"
@@ -71,6 +72,7 @@ def test_the_share_above_the_noise_is_that_of_what_is_left() -> None:
     assert report.to_json(result)["remaining"]["above_noise"] == result.above_noise
 
 
+@pytest.mark.study
 def test_nothing_is_rejected_for_another_where_no_other_is_kept() -> None:
     result = found("bump")
     assert not result.effects

@@ -115,6 +115,7 @@ def test_parameters_are_recovered_within_their_standard_errors(found: Result) ->
         assert found.base_parameters[name].stderr < relative * names[name]
 
 
+@pytest.mark.study
 def test_held_out_error_falls_to_the_noise(found: Result) -> None:
     assert found.verdict == "none"
     assert found.as_given_rms is not None

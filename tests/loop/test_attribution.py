@@ -75,6 +75,7 @@ def test_a_hidden_effect_is_named_and_leaves_the_noise(effect: str) -> None:
     assert effect.replace("_", " ") in result.summary
 
 
+@pytest.mark.study
 def test_sizes_are_those_in_the_seal() -> None:
     """Within the plant's other form: a density that slopes by up to 15 %, a clock that is off by 1e-4."""
     said, stderr = value(found("latency"), "latency", "delay")
@@ -178,6 +179,7 @@ def test_the_same_log_gives_the_same_result() -> None:
     assert report.text(short()) == report.text(again)
 
 
+@pytest.mark.study
 def test_play_in_the_wires_is_found_on_a_short_log() -> None:
     assert short().effects[0].name == "backlash"
     said, stderr = value(short(), "backlash", "half_width")

@@ -39,7 +39,7 @@ def extrapolated(coarse: Any, fine: Any) -> Any:
 
 # tip force [N] and tip z [m]; they belong to tendons that do not stretch: 1e-7 m/N moves z by less than 1e-6
 # m
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("kappa", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
 )
@@ -55,12 +55,14 @@ def test_tip_on_a_wall(kappa: float, force: float, z: float) -> None:
     assert [p.arclength for p in contact_energy.patches(fine)] == pytest.approx([0.07])
 
 
+@pytest.mark.study
 def test_wires_that_stretch_press_less() -> None:
     stiff, soft = pressed(8.0, 1e-7, planar=True), pressed(8.0, 1e-5, planar=True)
     # 0.575 and 0.567 N: the rod answers at the wall like a spring in series with its tendons
     assert soft.total_force[0] / stiff.total_force[0] == pytest.approx(0.985, abs=2e-3)
 
 
+@pytest.mark.study
 def test_bent_far_the_planar_answer_is_a_ridge() -> None:
     """From a mean curvature of about 12.4 1/m the tip slides along the wall and leaves the plane."""
     assert pressed(12.0, 1e-5).stability > 0.05
@@ -89,7 +91,7 @@ def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
         assert_allclose(found, getattr(free, name), rtol=0, atol=atol)
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_signorini(name: str) -> None:
     """No node inside, no force that pulls, no force across a gap; and it is a minimum, not a ridge."""
@@ -105,6 +107,7 @@ def test_signorini(name: str) -> None:
     assert 0.1 < size.max() < 3.0
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
     """Where phi is least its normal has no component along the rod; a node that held it would fail this."""
@@ -118,6 +121,7 @@ def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
         assert across == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_balance(name: str) -> None:
     """Moment: the curvature at the base holds all loads. Force: by definition here; by virtual work below."""

@@ -106,6 +106,7 @@ def test_a_stranger_is_refused_in_a_sentence(address: str, stranger: str, how: s
     assert key not in text
 
 
+@pytest.mark.study(beyond=12)
 @pytest.mark.parametrize("how", ["page", "websocket"])
 @pytest.mark.parametrize(
     ("name", "origin", "path"),
@@ -129,6 +130,7 @@ def test_whoever_has_the_address_is_let_in(address: str, name: str, origin: str,
     assert ("<html" in text) == (how == "page")
 
 
+@pytest.mark.study(beyond=1)
 def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> None:
     with websocket(address) as opened:
         assert len(opened.recv(timeout=60.0)) > 16

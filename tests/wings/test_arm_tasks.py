@@ -96,7 +96,7 @@ def test_random_actions_leave_numbers_finite_and_within_their_bounds(name, actio
     assert n_lost == 0
 
 
-@pytest.mark.study(beyond=4)
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "options", [{"n_steps": 1}, {"n_steps": 1, "action": "displacement"}, {"observation": "goal"}]

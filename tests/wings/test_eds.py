@@ -210,7 +210,7 @@ def test_what_a_drive_lacks_is_left_out_and_said(index, known, write):
         assert not made.nodes.moving.any()
 
 
-@pytest.mark.study(beyond=8)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize(("index", "sub"), [key for key in NEEDED if key[1] < 2])
 def test_what_is_needed_is_demanded_by_name(index, sub, write):
     path = write(without(index))

@@ -108,6 +108,7 @@ def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, a
     assert_allclose(Policy(run).act(observation), expected, atol=2e-5)
 
 
+@pytest.mark.study
 def test_resume_takes_more_steps(tmp_path: Path) -> None:
     train(short_plan(320), tmp_path)
     resume(tmp_path)

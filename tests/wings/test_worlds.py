@@ -422,6 +422,7 @@ def test_grid_of_robots_is_drawn_where_it_stands():
     assert world.jacobian().shape == (3, 15)
 
 
+@pytest.mark.study
 def test_hosted_view_resets_where_its_script_ends(shown):
     world = shown("neck_push")
     assert isinstance(world, HostedView)
