@@ -30,7 +30,7 @@ from .contact.iteration import ContactIteration, iterate_worlds, search_robots
 from .contact.node_placement import place_nodes
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import ray_hit
-from .jit import LANES, OnThreads, call_at, entry, parallel_entry
+from .jit import LANES, OnThreads, call_at, entry, parallel_entry, take_next
 from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
 from .rod.gather import predict
 from .rod.lanes import Lanes
@@ -51,7 +51,7 @@ def move_to_inputs(robots: Lanes, ports: Ports, params: Params, memory: Memory, 
 @entry
 def pass_some(
     task: int,
-    n_tasks: int,
+    taken: Ints,
     run: Run,
     params: Params,
     ports: Ports,
@@ -61,22 +61,25 @@ def pass_some(
     response: Response,
     loads: PointLoads,
 ) -> None:
-    """One forward pass of every n-th chunk of the robots of `run`, as this task of n."""
+    """One forward pass of the robots of `run`, chunk by chunk, with the scratch of this task."""
     n = len(run.robots)
     batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
     mode = Mode(run.n_col, run.predict, run.propagate, run.update, run.process, run.noise)
     lanes = np.empty(LANES, np.int64)
-    for start in range(task * LANES, n, n_tasks * LANES):
+    start = LANES * take_next(taken)
+    while start < n:
         count = min(LANES, n - start)
         for w in range(LANES):
             lanes[w] = run.robots[start + min(w, count - 1)]
         pass_chunk(Chunk(lanes, count, start), batch, output, run.scratch[task], mode)
+        start = LANES * take_next(taken)
 
 
 @parallel_entry
 def _pass_on_threads(
     address: int,
     n_tasks: int,
+    taken: Ints,
     run: Run,
     params: Params,
     ports: Ports,
@@ -87,13 +90,13 @@ def _pass_on_threads(
     loads: PointLoads,
 ) -> None:
     for task in prange(n_tasks):
-        call_at(address, task, n_tasks, run, params, ports, layout, memory, shape, response, loads)
+        call_at(address, task, taken, run, params, ports, layout, memory, shape, response, loads)
 
 
 @entry
 def iterate_some(
     task: int,
-    n_tasks: int,
+    taken: Ints,
     rows: ContactRows,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -103,16 +106,16 @@ def iterate_some(
     problem: ContactProblem,
     search: SearchWork,
 ) -> None:
-    """One contact iteration of every n-th world (`iterate_worlds`), as this task of n; there is a workspace
-    for each."""
+    """One contact iteration of each world (`iterate_worlds`), in the workspace of this task."""
     batch = ContactIteration(rows, rods, surfaces, motion, contacts, loads, problem, search)
-    iterate_worlds(task, n_tasks, batch)
+    iterate_worlds(task, taken, batch)
 
 
 @parallel_entry
 def _iterate_on_threads(
     address: int,
     n_tasks: int,
+    taken: Ints,
     rows: ContactRows,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -123,7 +126,7 @@ def _iterate_on_threads(
     search: SearchWork,
 ) -> None:
     for task in prange(n_tasks):
-        call_at(address, task, n_tasks, rows, rods, surfaces, motion, contacts, loads, problem, search)
+        call_at(address, task, taken, rows, rods, surfaces, motion, contacts, loads, problem, search)
 
 
 @entry
@@ -174,7 +177,7 @@ def arrange(
 @entry
 def search_some(
     task: int,
-    n_tasks: int,
+    taken: Ints,
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -183,15 +186,16 @@ def search_some(
     n_found: Ints,
     work: SearchWork,
 ) -> None:
-    """Smallest gap of every n-th robot, as this task of n, and its candidates for contact
-    (`search_robots`)."""
-    search_robots(task, n_tasks, rows, rods, surfaces, motion, found, n_found, work)
+    """Smallest gap of each robot, and its candidates for contact (`search_robots`), in the workspace of this
+    task."""
+    search_robots(task, taken, rows, rods, surfaces, motion, found, n_found, work)
 
 
 @parallel_entry
 def _search_on_threads(
     address: int,
     n_tasks: int,
+    taken: Ints,
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -201,7 +205,7 @@ def _search_on_threads(
     work: SearchWork,
 ) -> None:
     for task in prange(n_tasks):
-        call_at(address, task, n_tasks, rows, rods, surfaces, motion, found, n_found, work)
+        call_at(address, task, taken, rows, rods, surfaces, motion, found, n_found, work)
 
 
 @entry

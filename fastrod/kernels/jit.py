@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba import types
 from numba.core import cgutils
 from numba.core.registry import CPUDispatcher
@@ -208,13 +209,13 @@ def caller(signature: Any) -> Any:
     return _intrinsic(call)
 
 
-def _call_at(_: Any, address: Any, task: Any, n_tasks: Any, *given: Any) -> Any:  # noqa: ARG001
-    """Call the function of a task that is at this address: (task, n_tasks, *given) -> None."""
-    made = types.none(types.intp, types.intp, types.intp, _star(given))
+def _call_at(_: Any, address: Any, task: Any, *given: Any) -> Any:  # noqa: ARG001
+    """Call the function of a task that is at this address: (task, *given) -> None."""
+    made = types.none(types.intp, types.intp, _star(given))
 
     def generate(context: Any, builder: Any, made: Any, packed: Any) -> Any:
-        each = cgutils.unpack_tuple(builder, packed[3])  # type: ignore[no-untyped-call]
-        return _call(context, builder, types.none(*made.args[:3], *given), [*packed[:3], *each])
+        each = cgutils.unpack_tuple(builder, packed[2])  # type: ignore[no-untyped-call]
+        return _call(context, builder, types.none(*made.args[:2], *given), [*packed[:2], *each])
 
     return made, generate
 
@@ -224,8 +225,30 @@ call_at: Any = (
 )
 
 
+def _take_next(_: Any, taken: Any) -> Any:
+    """Number of the next piece of work: `taken` (1,) counts, for all threads, those that somebody does."""
+
+    def generate(context: Any, builder: Any, made: Any, given: Any) -> Any:
+        array = context.make_array(made.args[0])(context, builder, given[0])
+        one = context.get_constant(types.int64, 1)
+        return builder.atomic_rmw("add", array.data, one, "monotonic")
+
+    return types.int64(taken), generate
+
+
+def _take_next_alone(taken: Any) -> int:
+    taken[0] += 1
+    return int(taken[0] - 1)
+
+
+take_next: Any = _take_next_alone if _config.DISABLE_JIT else _intrinsic(_take_next)
+
+
 class OnThreads:
-    """A kernel that does one task of n, done for all of them: by itself, or each on a thread of its own.
+    """A kernel of many pieces of work, each for whoever is free: for one thread, or for several.
+
+    Every task calls it with (task, taken, ...), a workspace of its own, and takes piece after piece
+    (`take_next`): a thread that another process holds up then does fewer of them, and the others more.
 
     The loop over threads calls what is compiled already by its address. Had it the kernel in it, LLVM would
     compile that a second time (30 s for a pass of the rod, 3 s for the loop alone).
@@ -235,19 +258,20 @@ class OnThreads:
         self.one, self._loop, self._address = one, loop, 0
 
     def __call__(self, n_tasks: int, *given: Any) -> None:
-        """Do all `n_tasks` with what is given, side by side if there is more than one."""
+        """Do all the work in `n_tasks`, side by side if there is more than one."""
+        taken = np.zeros(1, np.int64)
         if n_tasks == 1:
-            self.one(0, 1, *given)
+            self.one(0, taken, *given)
             return
         if not self._address:
-            self._address = self._compiled(given)
-        self._loop(self._address, n_tasks, *given)
+            self._address = self._compiled((taken, *given))
+        self._loop(self._address, n_tasks, taken, *given)
 
     def _compiled(self, given: Sequence[Any]) -> int:
         """Compile both for what is given, and refuse anything else: the loop trusts the address."""
-        signature = types.none(types.intp, types.intp, *(() if _config.DISABLE_JIT else map(_typeof, given)))
-        if not _config.DISABLE_JIT:
-            loop: Any = self._loop
-            loop.compile(signature)
-            loop.disable_compile()
-        return _address_of(self.one, signature)
+        if _config.DISABLE_JIT:
+            return _address_of(self.one, None)
+        each, loop = [_typeof(one) for one in given], cast(Any, self._loop)
+        loop.compile(types.none(types.intp, types.intp, *each))
+        loop.disable_compile()
+        return _address_of(self.one, types.none(types.intp, *each))

@@ -25,7 +25,7 @@ from fastrod.types import (
     Surfaces,
 )
 
-from ..jit import inline, kernel
+from ..jit import inline, kernel, take_next
 from ..rod.gather import pick
 from ..vec import dot
 from .bvh import Numbers, Record
@@ -90,7 +90,7 @@ def _search_of(
 @kernel
 def search_robots(
     task: int,
-    n_tasks: int,
+    taken: Ints,
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
@@ -99,16 +99,18 @@ def search_robots(
     n_found: Ints,
     work: SearchWork,
 ) -> None:
-    """Candidates of every n-th of these robots, as this task of n, and its smallest gap into `motion`; -1
+    """Candidates of these robots, each for the task that takes it, and its smallest gap into `motion`; -1
     candidates where it has gone through an obstacle since the last step."""
     own = task_search_work(work, task)
-    for r in range(task, len(rows), n_tasks):
+    r = take_next(taken)
+    while r < len(rows):
         i = rows[r]
         far = motion.tracked[i] and moved_far(i, motion)
         if far and tunnelled(i, motion, rods.first[i], surfaces, own.stack)[0] >= 0:
             n_found[r], motion.gap[i] = -1, 0.0
         else:
             n_found[r], motion.gap[i] = search_obstacles(_search_of(i, rods, surfaces, motion, own, found[r]))
+        r = take_next(taken)
 
 
 @kernel
@@ -306,11 +308,12 @@ def _iterate_world(world: ContactWorld, rows: ContactRows, problem: ContactProbl
 
 
 @kernel
-def iterate_worlds(task: int, n_tasks: int, batch: ContactIteration) -> None:
-    """One contact iteration of every n-th world, as this task of n."""
+def iterate_worlds(task: int, taken: Ints, batch: ContactIteration) -> None:
+    """One contact iteration of the worlds, each for the task that takes it."""
     rows, problem = batch.rows, task_problem(batch.problem, task)
     work = task_search_work(batch.search, task)
-    for k in range(task, len(rows.start) - 1, n_tasks):
+    k = take_next(taken)
+    while k < len(rows.start) - 1:
         world = ContactWorld(
             rows.start[k],
             rows.start[k + 1],
@@ -324,6 +327,7 @@ def iterate_worlds(task: int, n_tasks: int, batch: ContactIteration) -> None:
         status = _iterate_world(world, rows, problem, work)
         for r in range(world.first, world.last):
             rows.status[r] = status
+        k = take_next(taken)
 
 
 @inline

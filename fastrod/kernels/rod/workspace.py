@@ -62,9 +62,8 @@ class Run(NamedTuple):
     robots: Lanes
     """(n_rows,) indices."""
     scratch: Lanes
-    """(n_tasks, scratch_size): the chunks are spread over so many tasks. Which of them does a chunk changes
-    no bit
-    of it."""
+    """(n_tasks, scratch_size): so many tasks share the chunks. Which of them does a chunk changes no bit of
+    it."""
     n_col: int
     predict: bool
     propagate: bool
