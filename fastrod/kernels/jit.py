@@ -274,4 +274,6 @@ class OnThreads:
         each, loop = [_typeof(one) for one in given], cast(Any, self._loop)
         loop.compile(types.none(types.intp, types.intp, *each))
         loop.disable_compile()
+        # by its types alone, as a call does: by a signature the cache would keep it a second time
+        cast(Any, self.one).compile((types.intp, *each))
         return _address_of(self.one, types.none(types.intp, *each))
