@@ -26,8 +26,8 @@ from cost import COSTS, QUICK
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CORES = 2
-# Threads of torch that spin while they wait take the core from those they wait for: a training takes eight times
-# as long on two busy cores. Those of the kernels sleep by themselves.
+# Threads of torch that spin while they wait take the core from those they wait for: a training takes eight
+# times as long on two busy cores. Those of the kernels sleep by themselves.
 SLEEPY = {"OMP_WAIT_POLICY": "passive"}
 
 
