@@ -70,6 +70,7 @@ def driven(case: str, **more: Any) -> tuple[Simulator, State]:
     return sim, state
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_settles_the_robots_whose_pass_diverged_and_no_others(case: str) -> None:
     (sim, state), (bare, lost) = driven(case), driven(case, recover=False)

@@ -144,6 +144,7 @@ def test_odd_inputs_are_a_state_or_a_sentence_that_changes_nothing(
         assert differing(sim.step(**good(sim, 4)), twin.step(**good(twin, 4))) == []
 
 
+@pytest.mark.study
 @tried(80)
 @given(
     name=st.sampled_from([*SHAPES]),
@@ -188,6 +189,7 @@ odd_rows = st.one_of(
 )
 
 
+@pytest.mark.study
 @tried(80)
 @given(
     rows=odd_rows,

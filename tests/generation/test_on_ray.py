@@ -61,6 +61,7 @@ def test_a_killed_ray_worker_loses_and_doubles_nothing(
     assert ray.is_initialized()
 
 
+@pytest.mark.study
 def test_ray_goes_on_with_what_processes_began(whole: Path, tmp_path: Path) -> None:
     generate(small(count=200), tmp_path, workers=1)
     summary = generate(small(), tmp_path, ray="auto", workers=1)

@@ -58,6 +58,7 @@ def test_noise_is_not_predicted() -> None:
     assert 0.97 * before < after < 1.25 * before
 
 
+@pytest.mark.study
 def test_missing_rows_are_left_out() -> None:
     residual = noise()
     residual[::7] = np.nan

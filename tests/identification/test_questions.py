@@ -234,6 +234,7 @@ def test_orientations_and_points_are_seen_by_the_same_camera() -> None:
     assert asked.startswith("the camera stands 34.")
 
 
+@pytest.mark.study
 def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(farlog.TOML)

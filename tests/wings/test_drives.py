@@ -160,6 +160,7 @@ def test_homing_ends_where_each_tendon_is_taut(ready):
     np.testing.assert_allclose(said, tension, atol=4 * 1.2e-4 * SPECS[0].newtons_per_torque)
 
 
+@pytest.mark.study
 def test_homing_then_goes_to_its_offset(ready):
     offset = np.array([-300, 300, -200, 100])  # lets out where growing counts pull
     end = ready.bus.homing(np.full(4, 100), 4000, offset=offset, rounds=1, order=[2, 0, 3, 1])

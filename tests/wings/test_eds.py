@@ -126,6 +126,7 @@ def bench(own=None, *, emulated=None):
     return BusBench(SPECS, Springs(2000.0), own=own, emulated=emulated)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("writing", WRITTEN)
 def test_a_file_is_read_however_it_is_written(drive, writing, tmp_path):

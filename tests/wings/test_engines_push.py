@@ -63,6 +63,7 @@ def test_push_against_friction_is_the_friction(stage):
     assert -held == pytest.approx(0.5 * (MASS * 9.81 + lifted), rel=0.01)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("mass", [0.01, 1.0])
 def test_light_and_heavy_cubes_are_not_launched(stage, mass):
     speeds, momentum, impulse, ok = push(stage, 0.01, "axial", gravity=0.0, duration=0.4, mass=mass)

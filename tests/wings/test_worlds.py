@@ -134,6 +134,7 @@ def test_free_robot_shows_itself_without_a_jump(robot):
     assert_allclose(tips[-1], tips[n], atol=1e-3 * robot.length)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["five_segment_reacher", "ethz_beam", "wall", "airway"])
 def test_base_moves_the_tip_along(name):
     world = open_world(name)
