@@ -12,16 +12,25 @@ from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
-from threadpoolctl import LibController, ThreadpoolController
+from threadpoolctl import ThreadpoolController
 
 _Given = ParamSpec("_Given")
 _Answer = TypeVar("_Answer")
 
 
 @cache
-def _libraries(with_scipy: bool) -> list[LibController]:  # noqa: ARG001
-    """The BLAS libraries of this process; scipy brings one of its own. Found once: to look takes 5 ms."""
-    return [lib for lib in ThreadpoolController().lib_controllers if lib.user_api == "blas"]
+def _libraries(with_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int], object]]]:  # noqa: ARG001
+    """How to ask and set the threads of each BLAS library of this process; scipy brings one of its own. Found
+    once: to look takes 5 ms. OpenBLAS is asked itself: by way of threadpoolctl a call costs 5 us more, which
+    is 1 % of a robot's step."""
+    found = list[tuple[Callable[[], int], Callable[[int], object]]]()
+    for lib in ThreadpoolController().lib_controllers:
+        names = [name for name in lib.check_symbols if hasattr(lib.dynlib, name)]
+        if lib.internal_api == "openblas" and lib.threading_layer == "pthreads":
+            found.append((lib.dynlib[names[0]], lib.dynlib[names[0].replace("_get_", "_set_")]))
+        elif lib.user_api == "blas":
+            found.append((lib.get_num_threads, lib.set_num_threads))
+    return found
 
 
 class _Held:
@@ -29,7 +38,7 @@ class _Held:
 
     lock = threading.Lock()
     callers = 0
-    before: list[tuple[LibController, int]]
+    before: list[tuple[Callable[[int], object], int]]
 
     @classmethod
     def enter(cls) -> None:
@@ -38,9 +47,9 @@ class _Held:
             cls.callers += 1
             if cls.callers == 1:
                 libraries = _libraries("scipy.linalg" in sys.modules)
-                cls.before = [(lib, n) for lib in libraries if (n := lib.num_threads) != 1]
-                for lib, _ in cls.before:
-                    lib.set_num_threads(1)
+                cls.before = [(allow, n) for count, allow in libraries if (n := count()) != 1]
+                for allow, _ in cls.before:
+                    allow(1)
 
     @classmethod
     def leave(cls) -> None:
@@ -48,8 +57,8 @@ class _Held:
         with cls.lock:
             cls.callers -= 1
             if cls.callers == 0:
-                for lib, n in cls.before:
-                    lib.set_num_threads(n)
+                for allow, n in cls.before:
+                    allow(n)
 
 
 def one_blas_thread(function: Callable[_Given, _Answer]) -> Callable[_Given, _Answer]:

@@ -2,7 +2,8 @@
 
 `@pytest.mark.study` marks a function that is too dear for every check, `@pytest.mark.study(beyond=n)` all its
 cases but the first n. A function that is not marked and costs more than `MOST`, all its cases together, fails
-the run. CPU time is counted, so that a busy machine does not matter; compiling and importing are not.
+the run. CPU time is counted, so that a busy machine does not matter; compiling and importing are not. A
+second of a slow core is worth less (`pace`).
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ import builtins
 import json
 import os
 import resource
+import time
 from collections import Counter
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numba
@@ -20,6 +23,7 @@ import pytest
 from numba.core import event
 
 MOST = 1.5  # CPU s: caps 195 functions of 2,400, which were half of all that the tests cost
+PACE = 0.0055  # CPU s of `pace` on an EPYC at 2.4 GHz that nobody else uses
 QUICK = 0.3  # CPU s: 4,898 of 5,616 cases cost less, and 144 s together
 COSTS = Path(__file__).with_name("costs.json")
 """CPU seconds of the functions above `QUICK`; `tests/check.py costs` writes it."""
@@ -32,14 +36,23 @@ def cpu_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
+def pace() -> float:
+    """CPU s of the same arithmetic on any machine: more where the core is slower, or shares its units with
+    another that works."""
+    begun = time.thread_time()
+    sum(i * i for i in range(100_000))
+    return time.thread_time() - begun
+
+
 class Once(event.Listener):
-    """CPU seconds of what a process does once, whichever test comes first: compiling and importing."""
+    """CPU seconds of what a process does once, whichever test comes first: importing, and compiling kernels
+    or reading them from the cache (numba does both under its lock)."""
 
     def __init__(self) -> None:
         self.spent, self._depth, self._begun = 0.0, 0, 0.0
         self._import = builtins.__import__
         builtins.__import__ = self._imported
-        event.register("numba:compile", self)
+        event.register("numba:compiler_lock", self)
 
     def on_start(self, what: Any) -> None:
         """Of the outermost import or compilation."""
@@ -65,8 +78,9 @@ class Cost:
     where they run, and summed up in the process that reports."""
 
     def __init__(self, config: pytest.Config, once: Once) -> None:
-        self._config, self._once, self._begun = config, once, 0.0
+        self._config, self._once, self._begun, self._n_cases = config, once, 0.0, 0
         self.spent: Counter[str] = Counter()
+        self.paces: list[float] = []
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -95,12 +109,17 @@ class Cost:
         """Give the report of the call its cost, the fixtures' included, and whether it is a study. What is
         torn down after it may be shared, a browser say."""
         if call.when == "call":
+            if self._n_cases % 25 == 0:
+                item.user_properties.append(("pace", pace()))
+            self._n_cases += 1
             study = item.get_closest_marker("study") is not None
             item.user_properties.append(("cost", (self._now() - self._begun, study)))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add to the cost of the function; a function is dear by those cases that are not studies."""
         for name, value in report.user_properties:
+            if name == "pace" and report.when == "call":
+                self.paces.append(value)
             if name == "cost" and report.when == "call":
                 seconds, study = value
                 self.spent[f"study {name_of(report.nodeid)}" if study else name_of(report.nodeid)] += seconds
@@ -115,21 +134,25 @@ class Cost:
         if self.too_dear() and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
+    def most(self) -> float:
+        """`MOST` CPU seconds at `PACE`, or as many more as this machine was slower while the tests ran."""
+        return MOST * max(1.0, median(self.paces) / PACE) if self.paces else MOST
+
     def too_dear(self) -> dict[str, float]:
-        """Functions that cost more than `MOST` and are not marked; none where the kernels are not compiled as
+        """Functions that cost more than `most` and are not marked; none where the kernels are not compiled as
         they are for a user."""
         return {
             name: spent
             for name, spent in self.spent.most_common()
-            if spent > MOST and not name.startswith("study ") and not any(_ALTERED)
+            if spent > self.most() and not name.startswith("study ") and not any(_ALTERED)
         }
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         """Name what is too dear."""
         for name, spent in self.too_dear().items():
             terminalreporter.write_line(
-                f"TOO DEAR {name}: {spent:.1f} CPU s, more than {MOST}; make it cheaper, or mark it with "
-                "@pytest.mark.study(beyond=n): its cases beyond the first n run in `tests/check.py studies`."
+                f"TOO DEAR {name}: {spent:.1f} CPU s, more than {self.most():.1f}; make it cheaper, or mark "
+                "it @pytest.mark.study(beyond=n): its cases beyond the first n run in `check.py studies`."
             )
 
 
