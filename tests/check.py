@@ -26,9 +26,10 @@ from cost import COSTS, QUICK
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CORES = 2
-# Threads of torch that spin while they wait take the core from those they wait for: a training takes eight
-# times as long on two busy cores. Those of the kernels sleep by themselves.
-SLEEPY = {"OMP_WAIT_POLICY": "passive"}
+# Threads of torch and of numpy's BLAS that spin while they wait take the cores from those they wait for: a
+# training takes eight times as long on two busy cores, and a test twice. Those of the kernels sleep by
+# themselves, and what fastrod does with BLAS it does on one thread; what tests compute for comparison is not.
+SLEEPY = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Job(NamedTuple):
