@@ -21,6 +21,7 @@ import numba
 import numpy as np
 from numba import types
 from numba.core import cgutils
+from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
@@ -118,11 +119,44 @@ def inline(function: _Function) -> _Function:
 _UNWRAPPED = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
+_NUMBA_IS_KNOWN = numba.version_info[:2] <= (0, 68)  # how it keeps code, which is nobody's to rely on
+
+
+class _Linked(JITCodeLibrary):
+    """Optimised code that is linked into its callers, and of which no machine code is made: nobody would call
+    it, and it took a fifth of the time of the compiler. As code that numba reads from its cache is linked."""
+
+    @property
+    def codegen(self) -> Any:
+        """Whoever takes the environment of the function, of which code that has no address has no need."""
+        return self
+
+    def set_env(self, env_name: str, env: Any) -> None:
+        """Of what is never called by itself there is none."""
+
+    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
+        """None."""
+        return 0
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
 class _Inner(CPUDispatcher):
     """What kernels call. Numba's wrappers for Python and C took half the time of the compiler, so it has
     none; the first call from Python compiles the function once more, with them."""
 
     wrapped: Callable[..., Any] | None = None
+
+    def compile(self, sig: Any) -> Any:
+        """Compile it, and whatever it calls, to be linked."""
+        made_by: Any = cast(Any, self.targetctx).codegen()
+        before = made_by._library_class
+        made_by._library_class = _Linked if _NUMBA_IS_KNOWN else before
+        try:
+            return super().compile(sig)
+        finally:
+            made_by._library_class = before
 
     def __call__(self, *given: Any) -> Any:
         if self.wrapped is None:
