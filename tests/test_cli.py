@@ -78,6 +78,7 @@ def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, 
     assert sorted(path.name for path in out.iterdir()) == ["replay.png", "residuals.csv"]
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("straight")
 def test_replay_of_one_run_into_the_default_folder(log: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)

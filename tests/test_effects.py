@@ -169,7 +169,7 @@ def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     assert_same(fresh, after, [1], [1])
 
 
-@pytest.mark.study(beyond=9)
+@pytest.mark.study(beyond=5)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None:
     robots = [having(two_segments(), at_typical(name, two_segments(), times)) for times in (0.0, 1.0, 1.4)]

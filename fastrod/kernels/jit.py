@@ -135,7 +135,8 @@ class _Linked(JITCodeLibrary):
         """Of what is never called by itself there is none."""
 
     def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
-        """None."""
+        """None; optimised it is from here on."""
+        self._ensure_finalized()
         return 0
 
     def _finalize_final_module(self) -> None:

@@ -277,6 +277,7 @@ def test_an_interrupt_leaves_whole_shards_alone(whole: Path, tmp_path: Path) -> 
     assert bits(tmp_path) == bits(whole)
 
 
+@pytest.mark.study
 def test_a_full_disk_leaves_nothing_half(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

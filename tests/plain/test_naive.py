@@ -23,6 +23,7 @@ def chain() -> Robot:
     )
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(
     "robot",
     [rod(), rod("passive"), rod(n_tendons=3, bending_stiffness=(0.002, 0.003)), chain()],

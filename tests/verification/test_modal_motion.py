@@ -218,7 +218,7 @@ def test_two_threads_give_what_one_gives() -> None:
 
 
 # tendons hold this rod: its place is wrong by what the acceleration of BDF1 is, of the first order
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize(("scheme", "order"), [("bdf1", 1), ("bdf2", 3), ("generalized_alpha", 3)])
 def test_the_error_of_a_step_is_reported(scheme: Any, order: int) -> None:
     robot = load_robot("prototype")

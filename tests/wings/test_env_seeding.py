@@ -42,6 +42,7 @@ def test_an_environment_does_not_know_its_neighbours(name, opened):
     assert not np.array_equal(found[0].observations[0], found[1].observations[0])
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("name", ROD_NAMES)
 def test_three_are_the_first_three_of_seventeen(name: str) -> None:
     few, many = (batch(name, n, n_steps=5) for n in (3, 17))

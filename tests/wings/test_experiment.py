@@ -193,6 +193,7 @@ def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench,
     assert policy.distance < 2e-3
 
 
+@pytest.mark.study
 def test_a_stop_on_the_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) -> None:
     emulator, made = bench.emulator, circle_plan()
     assert emulator is not None

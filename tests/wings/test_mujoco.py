@@ -175,6 +175,7 @@ def stand(ball=BALL, **options):
     return MujocoRod(robot, model, data, "post", **options), model, data
 
 
+@pytest.mark.study
 def test_contacts_of_the_capsules_are_read_back():
     rod, model, data = stand(SLIDING)
     data.xfrc_applied[model.body("ball").id, 0] = -0.05  # presses the ball on the rod

@@ -20,6 +20,7 @@ def test_scene_keeps_to_its_physics(name):
     assert all(np.isfinite(value) for value in figures.values())
 
 
+@pytest.mark.study(beyond=10)
 @pytest.mark.parametrize("name", names())
 def test_scene_says_what_it_is(name):
     scene = load(name)

@@ -217,7 +217,7 @@ def test_what_cannot_be_piloted_is_said(make: Any, error: type[Exception], sente
         make()
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("tip", "t", "sentence"),
     [

@@ -40,6 +40,7 @@ def follow(path, seconds, **options):
     return record(stage, times())
 
 
+@pytest.mark.study
 def test_check_fails_without_gain(monkeypatch):
     monkeypatch.setattr(TrackCircle, "duration", 3.0)
     monkeypatch.setattr(soft_ur5, "GAIN", 0.0)

@@ -118,6 +118,7 @@ def test_resume_takes_more_steps(tmp_path: Path) -> None:
     assert read_config(tmp_path)[0].steps == 640
 
 
+@pytest.mark.study
 def test_a_damaged_checkpoint_is_refused_in_a_sentence(tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(short_plan(160), run)
