@@ -136,7 +136,7 @@ class _Linked(JITCodeLibrary):
 
     def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
         """None; optimised it is from here on."""
-        self._ensure_finalized()
+        cast(Any, self)._ensure_finalized()
         return 0
 
     def _finalize_final_module(self) -> None:
