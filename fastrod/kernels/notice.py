@@ -14,9 +14,9 @@ _register: Any = event.register  # it has no types
 _PLACE = "fastrod.kernels."
 SECONDS = {
     "pass_some": ("the rod", 40),
-    "search_some": ("contact", 60),
-    "iterate_some": ("contact", 60),
-    "pass_modes": ("modes", 60),
+    "search_some": ("contact", 45),
+    "iterate_some": ("contact", 45),
+    "pass_modes": ("modes", 50),
     "derive_modes": ("derivatives of modes", 15),
 }
 """What the large kernels compute, and how long each group takes to compile on one core of 2025 [s]
