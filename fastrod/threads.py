@@ -15,8 +15,8 @@ from typing import ParamSpec, TypeVar
 from threadpoolctl import ThreadpoolController
 
 FEW = 64
-"""Robots whose products BLAS does by one thread anyway (it starts more from 9,216 numbers on): to hold it costs
-a robot's step 4 % of its time."""
+"""Robots whose products BLAS does by one thread anyway (it starts more from 9,216 numbers on): to hold it
+costs a robot's step 4 % of its time."""
 _Given = ParamSpec("_Given")
 _Answer = TypeVar("_Answer")
 
