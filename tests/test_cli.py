@@ -170,12 +170,13 @@ def test_identify_json_prints_json_and_nothing_else(
 
 
 def test_identify_takes_several_logs_and_the_default_folder(
-    measured: Path, tmp_path: Path, monkeypatch: Patch
+    measured: Path, tmp_path: Path, monkeypatch: Patch, capsys: Captured
 ) -> None:
     seen: dict[str, Any] = {}
 
     def stand_in(logs: Any, robot: Robot, **given: Any) -> Any:
         seen.update(given, names=[log.name for log in logs], folder=Path("small_identified").is_dir())
+        given["progress"]("base fit: 0.3 mm left", 0, 4)
         raise InputError("seen enough.")
 
     monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
@@ -184,8 +185,11 @@ def test_identify_takes_several_logs_and_the_default_folder(
     other.write_bytes(measured.read_bytes())
     assert fastrod(f"identify {measured} --robot prototype {other} --free-camera --max-effects 2") == 2
     assert seen["names"] == ["small", "other"]
-    given = [seen[name] for name in ("held_out", "max_effects", "free_camera", "progress")]
-    assert given == [[], 2, True, None]
+    assert [seen[name] for name in ("held_out", "max_effects", "free_camera")] == [[], 2, True]
+    assert capsys.readouterr().err == "seen enough.\n"  # short work says nothing where nobody looks on
+    monkeypatch.setattr("fastrod.commands.cli._PATIENCE", 0.0)
+    assert fastrod(f"identify {measured} --robot prototype --max-effects 0") == 2
+    assert capsys.readouterr().err == "0 s, 0 of 4: base fit: 0.3 mm left\nseen enough.\n"
     assert seen["folder"]  # made before the long work, and gone where nothing came of it
     assert not (tmp_path / "small_identified").exists()
 

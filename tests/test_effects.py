@@ -351,7 +351,7 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     assert_same(run(simulator(robot), lengths), run(simulator(again), lengths))
     text = dumps(load_robot("prototype")) + '\n[[effect]]\nname = "play"\nhalf_width = 0.0002\n'
     (link,) = Simulator(loads(text)).__dict__["_chain"].links
-    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0002, 0.0]])
+    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0002, 0.0, 0.0, 0.0]])
 
 
 def lash(**values: Any) -> Table:

@@ -6,6 +6,7 @@ import argparse
 import io
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from fastrod.model.robot import Robot
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
+BASE_FIT = "base fit: "
+"""How the sentence begins that `identify` says once its base model is fitted."""
+_PATIENCE = 10.0  # s without a line
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -136,7 +140,7 @@ def _identify(arguments: argparse.Namespace) -> int:
             free_camera=arguments.free_camera,
             network=arguments.network,
             dynamics=arguments.dynamics,
-            progress=bar,
+            progress=bar or _lines(),
         )
     written = [] if out is None else report.write(result, out)
     if arguments.json:
@@ -441,7 +445,8 @@ def _folder(out: Path | None) -> Iterator[None]:
 
 @contextmanager
 def _progress() -> Iterator[Callable[[str, int, int], None] | None]:
-    """A callback (what, done, total) that draws a bar on stderr, or None where stderr is no terminal."""
+    """A callback (what, done, total) that draws a bar on stderr, or None where stderr is no terminal. A
+    line of figures stays."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -450,7 +455,27 @@ def _progress() -> Iterator[Callable[[str, int, int], None] | None]:
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+
+        def draw(what: str, done: int, total: int) -> None:
+            if what.startswith(BASE_FIT):
+                bar.console.print(what, highlight=False)
+            bar.update(task, description=what, completed=done, total=total)
+
+        yield draw
+
+
+def _lines() -> Callable[[str, int, int], None]:
+    """The same for a stderr that is no terminal: a line every ten seconds, for work that may take minutes."""
+    begun = said = time.monotonic()
+
+    def line(what: str, done: int, total: int) -> None:
+        nonlocal said
+        now = time.monotonic()
+        if now - said > _PATIENCE or (what.startswith(BASE_FIT) and now - begun > _PATIENCE):
+            said = now
+            print(f"{now - begun:.0f} s, {done} of {total}: {what}", file=sys.stderr, flush=True)
+
+    return line
 
 
 if __name__ == "__main__":

@@ -194,6 +194,10 @@ class Law:
     reads_tension: ClassVar[bool] = False
     """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
     solve it together with the rod."""
+    nests: ClassVar[Mapping[str, Mapping[str, str | float]]] = {}
+    """Laws that this one contains, by name, and where: what each of these parameters is there, a number or
+    another parameter. Which of the two it is is decided by where the estimate lies, for the richer one never
+    fits worse."""
     refines: ClassVar[str] = ""
     """Another effect of the same cause: tried wherever that one is, and named only where the log tells the
     two laws apart."""

@@ -27,11 +27,14 @@ from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
+from fastrod.solver.motion import solver_of
 from fastrod.threads import one_blas_thread
 
 MAX_EFFECTS = 4
-# samples that the search looks at; the operators run over all, and what is found is fitted to all
+# samples that the search looks at; the operators run over all, and what is found is fitted to all. A row of a
+# rod of modes costs more, and such a robot has tens of unknowns, not hundreds
 _SEARCH_ROWS = 1500
+_SEARCH_ROWS_OF_MODES = 500
 _MIN_GAIN = (
     0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
 )
@@ -58,6 +61,7 @@ def identify(
 
     `held_out`: labels of runs, or `RUN@START:END` [s], that no fit sees; where none is given, every fourth
     stretch of each run. `max_effects` at most are named. `exclude` takes effects out of the library.
+    With `max_effects` 0 nothing is looked for: the base model is fitted, and that is the result.
     `free_camera` leaves registration, marker offset and latency to the fit. `network` trains a small network
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
     `dynamics` replays the log in motion, with inertia and damping, and fits the robot's own parameters alone:
@@ -77,7 +81,8 @@ def identify(
     if dynamics:
         return _in_motion(log, robot, model, progressed, threads)
     progressed("registration", 0, most)
-    some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
+    most_rows = _SEARCH_ROWS if solver_of([robot], None, False) == "observer" else _SEARCH_ROWS_OF_MODES
+    some = log.samples.on(thinned(log.rows, most_rows))
     reading = read(some, robot, threads=threads)
     if reading.refusal:
         raise LogError(reading.refusal)
@@ -87,6 +92,7 @@ def identify(
     progressed("base fit", 0, most)
     base = fit_base(some, log.rows, model, robot, frozenset(exclude), threads)
     check_motion(base, reading.guess)
+    progressed(base.sentence, 0, most)
     candidates = _candidates(base, max_effects, progressed)
     outcome = _needed(base, candidates, max_effects)
     progressed("prediction on all samples", most - 1, most)
@@ -135,10 +141,10 @@ def _candidates(
 ) -> SearchOutcome:
     """Effects and alternative patterns that explain the residual of the base model, in the order in which
     they were found."""
-    most = max_effects + _SPARE if max_effects else 0
+    most = max_effects + _SPARE
     search, state, known = base.search, base.start, base.start.model.effects
     names, steps = list[str](), list[SearchStep]()
-    for stage in range(most + _MORE_STAGES):
+    for stage in range(most + _MORE_STAGES if max_effects else 0):
 
         def report(name: str, done: int = stage + 1) -> None:
             progressed(name, min(done, most), most + 2)

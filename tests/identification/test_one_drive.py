@@ -67,7 +67,7 @@ def test_a_size_is_one_number_or_one_per_drive_or_one_per_segment() -> None:
     assert_array_equal(wiring.drive, [0, 1, 0, 1, 2, 3, 2, 3])
 
     def sizes(given: Any) -> list[float]:
-        return read_values("backlash", {"half_width": given}, wiring, "test")[:-1].tolist()
+        return read_values("backlash", {"half_width": given}, wiring, "test")[:4].tolist()
 
     assert sizes(1e-4) == [1e-4] * 4
     assert sizes([1e-4, 2e-4]) == [1e-4, 1e-4, 2e-4, 2e-4]

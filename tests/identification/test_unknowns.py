@@ -181,7 +181,8 @@ def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
     assert not any("creep" in name for name in names(model))
     more = model.with_effect("friction", {"half_width": 3e-4}, drop=("growth",))
     assert more.effects == ("drum_gain", "friction", "creep")
-    assert names(more)[2:] == ["friction.half_width", "friction.presliding", "friction.spread"]
+    starts = [f"friction.start_{k}" for k in (1, 2, 3, 4)]
+    assert names(more)[2:] == ["friction.half_width", "friction.presliding", "friction.spread", *starts]
     values = more.values(more.start)
     assert_array_equal(values["creep"], [0.1] * 4 + [2.0])
     assert_array_equal(values["drum_gain"], [0.02] * 4)

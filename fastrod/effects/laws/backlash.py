@@ -17,8 +17,8 @@ from fastrod.types import Floats
 class Backlash(Operator):
     """Play of gears and of tendons in their holes.
 
-    Equation: p = max(l - w, min(l + w, p)); rounded corners are the mean over half widths w (1 - c), w, w (1
-    + c)
+    Equation: p = max(l - w, min(l + w, p)), at first l + w z; rounded corners are the mean over half widths
+    w (1 - c), w, w (1 + c)
     Source: play operator (Visintin 1994); backlash of tendon drives (Palli and Melchiorri)
     Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
     speed
@@ -38,6 +38,8 @@ class Backlash(Operator):
             shared=True,
         ),
         Parameter("rounding", "", bounds=(0.0, 0.4), typical=0.15, starts=(0.15,), shape=True),
+        # where in its gap a drive stands at first: after homing at a flank
+        Parameter("start", "", bounds=(-1.0, 1.0), typical=0.5, starts=(0.0,), per="drive", shape=True),
     )
     excited_by = "slow reversals of many sizes"
     confounded_with = ("friction", "slack")
@@ -51,11 +53,11 @@ class Backlash(Operator):
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
-        out = dl.copy()
-        play(
-            out,
-            memory,
-            routing.by_tendon(values[:, :-1]),
-            np.repeat(values[:, -1:], routing.n_tendons, axis=1),
-        )
+        out, n = dl.copy(), routing.n_drives
+        gap, rounding = routing.by_tendon(values[:, :n]), np.repeat(values[:, n : n + 1], dl.shape[2], axis=1)
+        begin = routing.drive_sign * routing.by_tendon(values[:, n + 1 :]) * gap
+        widths = (begin * (1.0 - rounding), begin, begin * (1.0 + rounding))
+        at_first = np.concatenate([dl[:, 0] + each for each in widths], axis=1)
+        memory[:] = np.where(np.isnan(memory), at_first, memory)
+        play(out, memory, gap, rounding)
         return out

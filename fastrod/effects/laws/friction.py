@@ -50,9 +50,14 @@ class Friction(Operator):
         ),
         Parameter("growth", "1/rad", bounds=(0.0, 5.0), typical=0.4, starts=(0.4,), shape=True),
         Parameter("spread", "", neutral=0.5, bounds=(0.0, 1.6), typical=0.5, starts=(0.5,), shape=True),
+        # how far a drive's tendons are held ahead or back at first
+        Parameter("start", "", bounds=(-1.0, 1.0), typical=0.5, starts=(0.0,), per="drive", shape=True),
     )
     excited_by = "nested loops of decreasing amplitude at two speeds, with holds"
     confounded_with = ("backlash", "plastic_set", "creep")
+    nests: ClassVar[Mapping[str, Mapping[str, str | float]]] = {
+        "backlash": {"presliding": "half_width", "growth": 0.0}
+    }
     synonyms = ("hysteresis", "coulomb_friction", "capstan")
     separated_by: ClassVar[Mapping[str, str]] = {
         "backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is as wide "
@@ -68,12 +73,14 @@ class Friction(Operator):
         return np.full((n_robots, (1 + SLIDERS) * n_tendons), np.nan)
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
-        out = dl.copy()
-        n = routing.n_drives
+        out, n = dl.copy(), routing.n_drives
         wrapped = np.cumsum(np.linalg.norm(routing.bend(dl), axis=-1), axis=-1)
         presliding, growth, spread = (
             np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (n, n + 1, n + 2)
         )
+        held = -routing.drive_sign * routing.by_tendon(values[:, n + 3 :])
+        at_first = np.concatenate([dl[:, 0], *[held] * SLIDERS], axis=1)
+        memory[:] = np.where(np.isnan(memory), at_first, memory)
         elastoplastic(
             out, memory, routing.by_tendon(values[:, :n]), presliding, spread, growth, routing.by_end(wrapped)
         )

@@ -42,6 +42,7 @@ from fastrod.solver.motion import solver_of
 from fastrod.types import Flags, Floats, Ints, Params, Ports
 
 TOLERANCE = 1e-8  # of the robot's length: far below any camera
+_FINE = 2e-3  # of steps of slopes and of the tolerance, where tendons can go slack
 # passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some
 # hundreds of them)
 _LOST = 500
@@ -124,7 +125,11 @@ class PredictedRod:
             modes=MODES if solver_of([bare], None, False) == "modal" else None,
             threads=threads,
         )
-        self._tolerance = TOLERANCE * robot.length
+        # a step of first order goes by the tendons that are slack before it, and is wrong where others are
+        self._one_sided = any(tendon.unilateral for tendon in robot.tendons)
+        self.fine = _FINE if self._one_sided else 1.0
+        """Of the usual steps of slopes: a tendon that goes slack or taut within one bends it."""
+        self._tolerance = self.fine * TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
         self.tension: Floats = np.zeros((n, robot.n_tendons))
         """(n, n_tendons) of the last solution, 0 where no tendon stretches [N]."""
@@ -137,12 +142,14 @@ class PredictedRod:
         self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None, near: bool = False
     ) -> PredictedPose:
         """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is given.
-        `near` ones differ so little from the last that a difference of first order is all that counts."""
+        `near` ones differ so little from the last that a difference of first order is all that counts; where
+        tendons can go slack they are solved, too."""
         self.runs += 1
+        first_order = near and self._sim.solver == "modal" and not self._one_sided
         state = self._sim.settle_ports(
             ports,
             params,
-            math.inf if near and self._sim.solver == "modal" else self._tolerance,
+            math.inf if first_order else self._tolerance,
             None if rows is None or rows.all() else np.flatnonzero(rows),
             replace(robot, effects=()),
         )

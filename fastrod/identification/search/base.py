@@ -40,6 +40,14 @@ class BaseFit:
     """Parameters that this log cannot see; they stay nominal."""
     notes: tuple[str, ...]
 
+    @property
+    def sentence(self) -> str:
+        """What the base model leaves of the tip, once its own parameters are fitted."""
+        off = self.start.fit.residual[:, :3] * self.search.target.sigma
+        counted = off[np.any(off != 0.0, axis=1)]
+        rms = float(np.sqrt((counted**2).sum(1).mean())) if len(counted) else 0.0
+        return f"base fit: {1e3 * rms:.3g} mm left of a noise of {1e3 * self.noise.floor:.2g} mm"
+
 
 def fit_base(
     samples: LogSamples, rows: Ints, model: Model, robot: Robot, excluded: frozenset[str], threads: int | None

@@ -19,6 +19,7 @@ import numpy as np
 from fastrod.effects.base import Seam, get_effect, has_memory
 from fastrod.effects.executor import Link, act, approached, feels_tip, tip_feedback
 from fastrod.effects.ports import CHANGEABLE
+from fastrod.errors import RobotError
 from fastrod.identification.log.forward import (
     LogSamples,
     PredictedPose,
@@ -170,11 +171,11 @@ class LinearisedModel:
         if not n:
             return np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
         if any(math.isfinite(s.axial_stiffness) for s in self.robot.segments):
-            changes, steps, back = np.eye(n), _BEND * wiring.tendon_offset, np.eye(n)
+            changes, steps, back = np.eye(n), self.rod.fine * _BEND * wiring.tendon_offset, np.eye(n)
         else:
             bends = np.eye(2 * wiring.n_segments).reshape(-1, wiring.n_segments, 2)
             changes, back = wiring.tendon_change(bends), wiring.bend_from_tendons
-            steps = np.full(len(changes), _BEND)
+            steps = np.full(len(changes), self.rod.fine * _BEND)
         every = [
             self._solved(length=self.opened.tendon_length + step * change) / step
             for change, step in zip(changes, steps, strict=True)
@@ -184,7 +185,8 @@ class LinearisedModel:
     @cached_property
     def by_force(self) -> Floats:
         """(n, 6 + 3k, 3) per N, world."""
-        step = _FORCE * min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
+        size = min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
+        step = self.rod.fine * _FORCE * size
         return np.stack(
             [self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)],
             axis=-1,
@@ -223,7 +225,7 @@ class LinearisedModel:
         """(n, 6 + 3k) change of the true pose per unit of an unknown that needs the rod, one-sided difference
         at the reference."""
         if unknown.place not in self._columns:
-            step = unknown.scale
+            step = self.rod.fine * unknown.scale
             model, theta = self.model, self.theta
             if unknown.place[0] == "effect" and unknown.place[1] not in model.effects:
                 model = model.with_effect(unknown.place[1])
@@ -309,7 +311,11 @@ class LinearisedModel:
         )
 
     def residual(self, model: Model, theta: Floats) -> Floats:
-        """(n, n_out) weighted."""
+        """(n, n_out) weighted; infinite where no robot has these numbers."""
+        try:
+            model.robot_at(theta)
+        except RobotError:
+            return np.full_like(self.target.residual(self.pose), np.inf)
         return self.target.residual(
             self.seen(
                 model, theta, self.closed(model, theta, self.driven(model, theta) + self.solved(model, theta))

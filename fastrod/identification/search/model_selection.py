@@ -3,15 +3,16 @@ rival, or needless."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fastrod.effects.base import get_effect, trait
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern
 from fastrod.identification.search.linearised import LinearisedModel
-from fastrod.identification.search.solve import Fit, bic, effective_size, paired
+from fastrod.identification.search.solve import Fit, bic, covariance, effective_size, paired
 from fastrod.types import Floats
 
 Z_ACCEPT, BIC_ACCEPT, FRACTION_ACCEPT = 3.0, 10.0, 0.006
@@ -25,6 +26,8 @@ FRACTION_RIVAL = 0.05
 # of what the best takes away: beside much that is left, all that take a little away would be alike
 FRACTION_GAIN = 0.2
 Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
+# standard errors from a law that another one contains: nearer it is that law, further the richer one
+NEAR_SUB_LAW, FAR_FROM_SUB_LAW = 2.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +130,53 @@ def equally_wrong(before: float, best: float, other: float, noise: float) -> boo
     """Whether of two held-out losses, the `best` and another one, both are so far above that of the `noise`
     that they differ by less than their forms are wrong; and both take about as much off the loss `before`."""
     return other - best < min(FRACTION_RIVAL * (best - noise), FRACTION_GAIN * (before - best))
+
+
+def from_sub_law(state: ModelState, name: str, where: Mapping[str, str | float]) -> float:
+    """How far the estimate of an effect lies from a law that it contains (`Law.nests`), in standard errors;
+    of several parameters the furthest."""
+    theta, spread = state.theta, covariance(state.fit)
+    labels = [u.name.removeprefix(f"{name}.") for u in state.model.unknowns]
+
+    def number(parameter: str) -> tuple[float, Floats]:
+        """Its value, and the slopes of that by the fitted numbers."""
+        j = next(j for j, label in enumerate(labels) if label.startswith(parameter))
+        slopes, unknown = np.zeros(len(spread)), state.model.unknowns[j]
+        value = unknown.inside(float(theta[j]))
+        slopes[j] = value if unknown.log else 1.0
+        return value, slopes
+
+    furthest = 0.0
+    for parameter, there in where.items():
+        value, slopes = number(parameter)
+        at, by = number(there) if isinstance(there, str) else (there, np.zeros(len(spread)))
+        stderr = float(np.sqrt((slopes - by) @ spread @ (slopes - by)))
+        furthest = max(furthest, abs(value - at) / max(stderr, 1e-300) if value != at else 0.0)
+    return furthest
+
+
+def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candidate]) -> list[Candidate]:
+    """The best and its rivals, once laws that contain one another are told apart: near the law that it
+    contains the richer one is not listed, far from it the contained one is not, and between they are
+    rivals."""
+    for rich in [best, *rivals]:
+        for name, where in trait(get_effect(rich.name), "nests").items():
+            sub = next((c for c in tried if c.name == name and c.passes), None)
+            if sub is None or sub.state is None or rich.state is None:
+                continue
+            if sub.state.model.drive_of(name) != rich.state.model.drive_of(rich.name):
+                continue
+            far = from_sub_law(rich.state, rich.name, where)
+            others = [c for c in [best, *rivals] if c.name not in (rich.name, name)]
+            first = best.name in (rich.name, name)
+            if far <= NEAR_SUB_LAW:
+                both = [sub]
+            elif far >= FAR_FROM_SUB_LAW and rich.passes:
+                both = [rich]
+            else:
+                both = [best, rich if best is sub else sub] if first else [rich, sub]
+            best, *rivals = [*both, *others] if first else [*others, *both]
+    return [best, *rivals]
 
 
 def unphysical(state: ModelState, name: str) -> str:

@@ -38,6 +38,7 @@ from fastrod.identification.search.model_selection import (
     SearchStep,
     advantage,
     best_of,
+    by_estimate,
     equally_wrong,
     unphysical,
     z_between,
@@ -476,6 +477,7 @@ class Search:
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
+        best, *rivals = by_estimate(best, rivals, tried)
         return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
