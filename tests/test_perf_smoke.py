@@ -320,6 +320,7 @@ def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.Ca
     assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in tables["engines"])
 
 
+@pytest.mark.study
 def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str]) -> None:
     import fastrod_envs
 

@@ -39,6 +39,10 @@ ASL_NOISE = 5e-6
 """Of the tip at rest, per axis, published [m]."""
 ASL_COMPLIANCE = 1e-3
 """Nominal [m/N]: the tendons are kept tight by springs."""
+ASL_PRETENSION = 5.0
+"""Nominal [N], of every tendon at rest."""
+ASL_AXIAL_STIFFNESS = (300.0, 400.0, 500.0)
+"""Nominal [N], by segment: a hose that the tendons shorten."""
 
 ARMLAB_LENGTH = 0.108
 """Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
@@ -62,14 +66,14 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
     run's first row, where the motors are within 4 deg of rest (rest pose and motor zeros change between
     sessions).
 
-    Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool
-    are one push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool
-    radius times the *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the
-    measured angles phi (up to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2. Nominal: spool
-    radius, pitch radius, tendon compliance, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a
-    corrugated hose bends but hardly twists; much less, and the pushing half of the pairs, which has no
-    pretension here, would buckle it), a weightless body. Only `payload` loads the rod, and how far it sags
-    rests on the nominal stiffness.
+    Published: disk heights, which motor ends where, pull directions, payload. A motor pulls one tendon and
+    pays out its antagonist, and both can only pull: twelve tendons, in the order of motors 3 5 | 1 6 | 2 4,
+    the one that the motor pulls first. `dl` = -spool radius times the *commanded* motor angle u, for that is
+    what a user has beforehand, and its negative for the antagonist; `extra` keeps the measured angles phi (up
+    to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2. Nominal: spool radius, pitch radius, tendon
+    compliance and pretension, axial stiffness, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a
+    corrugated hose bends but hardly twists), a weightless body. Only `payload` loads the rod, and how far it
+    sags rests on the nominal stiffness.
     """
     table, where = _table(path, "asl_trunk"), Path(path).name
     disks = [
@@ -87,7 +91,11 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
         t=numbers(table, "t_s", where),
         run=labels,
         dl=np.stack(
-            [-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where)) for motor in order],
+            [
+                sign * ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where))
+                for motor in order
+                for sign in (-1.0, 1.0)
+            ],
             axis=1,
         ),
         tip_position=disks[2],
@@ -105,17 +113,21 @@ def _asl_robot() -> Robot:
             length=end - start,
             bending_stiffness=(0.05, 0.05),
             torsional_stiffness=0.5,
+            axial_stiffness=axial,
             body_radius=0.04,
             tendons=tuple(
                 Tendon(
                     offset=ASL_PITCH_RADIUS,
-                    angle=math.radians(ASL_DIRECTION[motor]),
+                    angle=math.radians(math.remainder(ASL_DIRECTION[motor] + half_turn, 360.0)),
                     compliance=ASL_COMPLIANCE,
+                    pretension=ASL_PRETENSION,
+                    unilateral=True,
                 )
                 for motor in motors
+                for half_turn in (0.0, 180.0)
             ),
         )
-        for start, end, motors in zip(starts, ASL_DISKS, ASL_MOTORS, strict=True)
+        for start, end, axial, motors in zip(starts, ASL_DISKS, ASL_AXIAL_STIFFNESS, ASL_MOTORS, strict=True)
     ]
     return Robot(
         name="asl_trunk",
@@ -126,10 +138,12 @@ def _asl_robot() -> Robot:
             "tendon.*.gain": {"sd": 0.5},
             "tendon.*.zero": {"sd": 0.01},
             "segment.*.length": {"sd": 0.005},
+            "segment.*.bending_stiffness": {"sd": 0.03},
+            "segment.*.axial_stiffness": {"sd": 300.0},
             "tendon.*.compliance": {"sd": 1e-3},
-            "segment.*.bending_stiffness": {"sd": 0.002, "shared": True},
+            "tendon.*.pretension": {"sd": 4.0},
         },
-        sensor={"registration_sd": (0.01, 0.05), "noise": ASL_NOISE},
+        sensor={"registration_sd": (0.01, 0.05), "noise": ASL_NOISE, "latency_sd": 0.15},
     )
 
 

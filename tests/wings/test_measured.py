@@ -13,6 +13,7 @@ from fastrod.errors import LogError, UnknownNameError
 from fastrod.identification.log.base_model import base_model
 from fastrod.logs.runlog import read_log, write_log
 from fastrod.model.robotfile import dumps, loads
+from fastrod.model.routing import route
 from fastrod_scenes import measured
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam
 
@@ -60,14 +61,19 @@ def test_asl_trunk_units_frame_and_order(tmp_path: Path) -> None:
     assert log.points is not None
     assert_allclose(log.points[0], [[0.0, 0.0, 0.106], [0.0, 0.0, 0.202]], atol=1e-12)
     # commanded; motors 3 5 | 1 6 | 2 4
-    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])
+    assert_allclose(np.degrees(-log.dl[1, ::2] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])
+    assert_array_equal(log.dl[:, 1::2], -log.dl[:, ::2])  # the antagonist is paid out
     assert sorted(log.extra) == [f"phi{k}_deg" for k in range(1, 7)]
     assert_allclose([log.extra[f"phi{k}_deg"][1] for k in range(1, 7)], [10, 20, 30, 40, 50, 60])  # measured
     assert log.payload is not None
     assert_allclose(log.payload, 0.1)
     assert robot.length == pytest.approx(0.320)
-    assert_allclose(robot.rest_tendon_length, [0.106, 0.106, 0.202, 0.202, 0.320, 0.320])
-    places = np.array([tendon.position(1)[0] for tendon in robot.tendons]) / measured.ASL_PITCH_RADIUS
+    assert_allclose(robot.rest_tendon_length, np.repeat([0.106, 0.202, 0.320], 4))
+    assert all(tendon.unilateral and tendon.pretension > 0.0 for tendon in robot.tendons)
+    every = np.array([tendon.position(1)[0] for tendon in robot.tendons]) / measured.ASL_PITCH_RADIUS
+    assert_allclose(every[1::2], -every[::2], atol=1e-12)
+    assert_array_equal(route(robot).drive, np.repeat(np.arange(6), 2))  # both are one motor's
+    places = every[::2]
     assert_allclose(places[4], [math.cos(math.radians(-105.0)), math.sin(math.radians(-105.0))])
     # the two tendons of a segment pull at right angles, so that they set its whole bend
     assert_allclose(np.sum(places[::2] * places[1::2], axis=1), 0.0, atol=1e-12)
@@ -115,8 +121,9 @@ def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
     """Identification may move the numbers that nobody publishes, and the frame, but not what is published."""
     (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(armlab_file(tmp_path))
     free = {robot.name: [u.name for u in base_model(robot).unknowns] for robot in (trunk, tdcr)}
-    tendons = {f"tendon.{k}.{what}" for k in range(1, 7) for what in ("gain", "zero")}
-    assert set(free["asl_trunk"]) >= tendons | {"segment.3.length"}
+    tendons = {f"tendon.{k}.{what}" for k in range(1, 13, 2) for what in ("gain", "zero")}
+    slack = {f"tendon.{k}.{what}" for k in range(1, 13) for what in ("compliance", "pretension")}
+    assert set(free["asl_trunk"]) >= tendons | slack | {"segment.3.length", "segment.3.axial_stiffness"}
     assert {"segment.1.length", "tendon.*.offset"} <= set(free["armlab_tdcr"])
     for robot in (trunk, tdcr):
         assert robot.sensor["registration_sd"] == (0.01, 0.05)
@@ -195,7 +202,7 @@ def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
     order = [motor for pair in measured.ASL_MOTORS for motor in pair]
-    reported = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
+    reported = np.degrees(-log.dl[:, ::2] / measured.ASL_SPOOL_RADIUS)
     felt = np.stack([log.extra[f"phi{motor}_deg"] for motor in order], axis=1)
     assert np.sqrt(np.mean((felt - reported) ** 2)) == pytest.approx(11.5, abs=0.1)
     late = [np.sqrt(np.mean((felt[k:] - reported[: len(reported) - k]) ** 2)) for k in range(12)]

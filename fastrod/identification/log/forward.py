@@ -145,7 +145,7 @@ class PredictedRod:
         `near` ones differ so little from the last that a difference of first order is all that counts; where
         tendons can go slack they are solved, too."""
         self.runs += 1
-        first_order = near and self._sim.solver == "modal" and not self._one_sided
+        first_order = near and self.of_modes and not self._one_sided
         state = self._sim.settle_ports(
             ports,
             params,
@@ -166,6 +166,11 @@ class PredictedRod:
         return PredictedPose(
             *from_base(ports.base_pose, state.tip_position, state.tip_rotation, points), state.ok
         )
+
+    @property
+    def of_modes(self) -> bool:
+        """Whether the robot needs modes."""
+        return self._sim.solver == "modal"
 
     def keep(self) -> object:
         """What `back` needs to return to the boundary of the last solve."""
