@@ -7,13 +7,11 @@ import importlib
 import json
 import math
 from collections import Counter
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from rods import bend, rod
 
 from fastrod.reference import shoot
 
@@ -237,31 +235,6 @@ def test_a_log_that_breaks_is_a_row() -> None:
     row = safely(Case("single", 3, "no such effect"))
     assert row["error"]
     assert not score("single", row)
-
-
-def test_a_robot_and_its_tendons_stiffer_alike_change_under_loads_only() -> None:
-    from bench_measured import stiffer
-    from fastrod import Simulator
-
-    for effects in (
-        (),
-        ({"name": "tendon_stretch", "compliance": 2e-4},),
-        ({"name": "drum_gain", "gain": [0.1, -0.05]},),
-    ):
-        soft = replace(rod(compliance=1e-4), effects=effects)
-        lengths = bend(soft, 0.6, -0.4)
-        for factor in (0.5, 8.0):
-            hard = stiffer(soft, factor)
-            one, two = (Simulator(r).settle(lengths, tolerance=1e-12) for r in (soft, hard))
-            assert one.ok.all()
-            assert two.ok.all()
-            np.testing.assert_allclose(two.tip_position, one.tip_position, rtol=0, atol=1e-9)
-            loaded = [
-                Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)
-            ]
-            moved = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
-            # in proportion, but for the bend that it adds
-            assert moved[1] * factor == pytest.approx(moved[0], rel=0.15)
 
 
 def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:

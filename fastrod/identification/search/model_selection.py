@@ -158,7 +158,7 @@ def from_sub_law(state: ModelState, name: str, where: Mapping[str, str | float])
 def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candidate]) -> list[Candidate]:
     """The best and its rivals, once laws that contain one another are told apart: near the law that it
     contains the richer one is not listed, far from it the contained one is not, and between they are
-    rivals."""
+    rivals if the evidence cannot tell them apart."""
     for rich in [best, *rivals]:
         for name, where in trait(get_effect(rich.name), "nests").items():
             sub = next((c for c in tried if c.name == name and c.passes), None)
@@ -167,15 +167,15 @@ def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candid
             if sub.state.model.drive_of(name) != rich.state.model.drive_of(rich.name):
                 continue
             far = from_sub_law(rich.state, rich.name, where)
+            if far <= NEAR_SUB_LAW:
+                kept = sub
+            elif far >= FAR_FROM_SUB_LAW and rich.passes:
+                kept = rich
+            else:
+                continue  # for the evidence to say
             others = [c for c in [best, *rivals] if c.name not in (rich.name, name)]
             first = best.name in (rich.name, name)
-            if far <= NEAR_SUB_LAW:
-                both = [sub]
-            elif far >= FAR_FROM_SUB_LAW and rich.passes:
-                both = [rich]
-            else:
-                both = [best, rich if best is sub else sub] if first else [rich, sub]
-            best, *rivals = [*both, *others] if first else [*others, *both]
+            best, *rivals = [kept, *others] if first else [*others, kept]
     return [best, *rivals]
 
 
