@@ -15,6 +15,9 @@ from fastrod import Robot, Tendon
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, target_of
+from fastrod.identification.search.model_selection import ModelState
+from fastrod.identification.search.search import Search
+from fastrod.identification.search.solve import Fit
 from fastrod.types import Floats
 
 
@@ -93,3 +96,21 @@ def test_a_trial_that_is_no_robot_is_a_worse_trial() -> None:
     found = near.fit(model, model.start, 10)
     assert found.loss < (near.residual(model, model.start) ** 2).sum()
     assert model.robot_at(found.theta).segments[0].length == pytest.approx(found.theta[j])
+
+
+def test_a_step_that_leads_to_worse_is_halved() -> None:
+    """Where a fit along slopes has led far beyond what they say, the rod is solved nearer to where it was."""
+    samples, model = at_the_limit(), base_model(robot())
+    tip = predict(model, model.start, samples, PredictedRod(samples, robot())).position
+    samples = replace(samples, log=replace(samples.log, tip_position=tip))
+    target = target_of(samples, np.full(3, 1e-3), rotation_sigma=ANGLE, points=False)
+    search = Search(samples, PredictedRod(samples, robot()), target, np.zeros(len(tip), int))
+    near, far = model.start, model.start
+    (j,) = (j for j, u in enumerate(model.unknowns) if u.name == "segment.1.axial_stiffness")
+    near[j], far[j] = 84.0, 50.0
+    last = LinearisedModel(model, near, samples, search.rod, target)
+    before = last.residual(model, near)
+    fit = Fit(far, before, last.slopes(model, near, before), np.zeros(len(near)), (False,) * len(near))
+    solved, theta = search._solved(ModelState(model, last, fit, np.zeros(20)))
+    assert theta[j] == pytest.approx(84.0 - 34.0 / 8.0)
+    assert (solved.residual(model, theta) ** 2).sum() < (before**2).sum()

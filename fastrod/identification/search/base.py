@@ -89,6 +89,8 @@ def fit_base(
     search = replace(search, noise=noise.sigma, row_correlation=noise.row_correlation(samples))
     for _ in range(2):
         search, state = search.weighed(state, noise.sigma)
+    if search.rod.of_modes:  # where the last step has led, solved
+        state = search.refined(state, iterations=0)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=tuple(notes))
 
 

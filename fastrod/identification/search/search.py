@@ -60,6 +60,7 @@ MOST_PASSES = 4000.0
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
+_BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
@@ -91,18 +92,33 @@ class Search:
 
     def refined(self, state: ModelState, iterations: int = 4) -> ModelState:
         """The same with the rod solved at the state's own parameters."""
-        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
+        linearised, theta = self._solved(state)
         fit = self._fit(
-            linearised,
-            state.model,
-            state.theta,
-            state.fit.theta[len(state.theta) :],
-            state.alternatives,
-            iterations,
+            linearised, state.model, theta, state.fit.theta[len(theta) :], state.alternatives, iterations
         )
         if not np.isfinite(fit.loss):
             return state
         return self._state(state.model, linearised, fit, state.alternatives)
+
+    def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
+        """The model solved at a state's parameters, and these. Of a rod of modes, whose tendons go slack
+        where no slope says so, at parameters that are nearer to those of the last solution, where it fitted
+        better."""
+        model, theta, last = state.model, state.theta, state.linearised
+
+        def cost(of: LinearisedModel, at: Floats) -> float:
+            mean, sd = model.prior
+            return float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
+
+        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        if self.rod.of_modes and last.model.unknowns == model.unknowns:
+            before = cost(last.under(self.target), last.theta)
+            for _ in range(_BACK):
+                if cost(linearised, theta) <= before:
+                    break
+                theta = 0.5 * (theta + last.theta)
+                linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        return linearised, theta
 
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
         """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
