@@ -62,6 +62,8 @@ class Place:
         self.linearised = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
 
     def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
+        # again from where it ended: within the tolerance of one solution, it hangs on what came before
+        predict(model, theta, self.samples, self.rod)
         pose = predict(model, theta, self.samples, self.rod)
         assert pose.ok.all()
         return self.target.residual(pose)
