@@ -118,13 +118,13 @@ def _asl_robot() -> Robot:
             tendons=tuple(
                 Tendon(
                     offset=ASL_PITCH_RADIUS,
-                    angle=math.radians(math.remainder(ASL_DIRECTION[motor] + half_turn, 360.0)),
+                    angle=math.radians(math.remainder(ASL_DIRECTION[motor] + opposite, 360.0)),
                     compliance=ASL_COMPLIANCE,
                     pretension=ASL_PRETENSION,
                     unilateral=True,
                 )
                 for motor in motors
-                for half_turn in (0.0, 180.0)
+                for opposite in (0.0, 180.0)
             ),
         )
         for start, end, axial, motors in zip(starts, ASL_DISKS, ASL_AXIAL_STIFFNESS, ASL_MOTORS, strict=True)

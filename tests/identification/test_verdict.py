@@ -79,8 +79,17 @@ def test_structure_that_nothing_explains_is_not_in_the_library(
 
 
 def test_structure_below_six_percent_is_none() -> None:
-    assert grounds(structure=ResidualStructure(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
-    assert grounds(structure=ResidualStructure(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
+    noise = {"base": 2.0 * FLOOR, "library": 2.0 * FLOOR, "after": 2.0 * FLOOR}
+    below, above = (ResidualStructure(0.03, 0.02, drift, 0.0, 5.0) for drift in (0.009, 0.011))
+    assert grounds(structure=below, **noise).verdict == "none"
+    assert grounds(structure=above, **noise).verdict == "not_in_library"
+
+
+def test_an_error_of_many_times_the_noise_is_not_none_however_white() -> None:
+    """Steps of the measured trunk: 50 mm beside 9 um, and nothing in it that the audit tells."""
+    made = grounds()
+    assert (made.verdict, made.kind, made.left) == ("not_in_library", "unknown", 1.0)
+    assert "is 3.32 times the noise" in made.summary
 
 
 @pytest.mark.parametrize(("alternative", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])

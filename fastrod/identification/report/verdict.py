@@ -22,6 +22,7 @@ _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what
 _FOREIGN = 0.3
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
+_NO_NOISE = 9.0  # of the noise's variance: so much is none, however white
 _MOST_STRAINED = 3  # parameters beyond their priors that the summary names
 AT_A_PRICE = "With that, the model explains this log down to its noise."
 """The summary where nothing is found, but a parameter is beyond its prior."""
@@ -79,7 +80,14 @@ def choose_verdict(
         else structure.kind
     )
     if not found and not alternatives:
-        if structure.structured <= CLEAN:
+        white = structure.structured <= CLEAN
+        if white and base > _NO_NOISE * floor:
+            times = float(np.sqrt(base / max(floor, 1e-30)))
+            said = (
+                f"What the model leaves is {times:.3g} times the noise, in no pattern that the test tells."
+            )
+            return VerdictGrounds("not_in_library", said, "unknown", 1.0, (), False)
+        if white:
             return VerdictGrounds(
                 "none",
                 "The model explains this log down to its noise; nothing is missing that this log could show.",
