@@ -83,9 +83,7 @@ def choose_verdict(
         white = structure.structured <= CLEAN
         if white and base > _NO_NOISE * floor:
             times = float(np.sqrt(base / max(floor, 1e-30)))
-            said = (
-                f"What the model leaves is {times:.3g} times the noise, in no pattern that the test tells."
-            )
+            said = f"What the model leaves is {times:.3g} times the noise, in no pattern that the test tells."
             return VerdictGrounds("not_in_library", said, "unknown", 1.0, (), False)
         if white:
             return VerdictGrounds(
