@@ -119,7 +119,8 @@ def inline(function: _Function) -> _Function:
 _UNWRAPPED = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-_NUMBA_IS_KNOWN = numba.version_info[:2] <= (0, 68)  # how it keeps code, which is nobody's to rely on
+# how it keeps code is its own affair: with a version that was not tried, inner code is made as numba does
+_NUMBA_IS_KNOWN = numba.version_info[:2] == (0, 68)
 
 
 class _Linked(JITCodeLibrary):

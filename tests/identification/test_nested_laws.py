@@ -95,10 +95,10 @@ def test_the_estimate_decides(growth: float, first: str, names: list[str]) -> No
     others = [candidate("creep", fitted("creep"))]
     best = both.pop(first)
     (second,) = both.values()
-    told = by_estimate(best, [*others, second], [best, second, *others])
-    assert [c.name for c in told if c.name != "creep"] == names
-    assert told[0].name == names[0]
-    assert "creep" in [c.name for c in told]
+    kept = by_estimate(best, [*others, second], [best, second, *others])
+    assert [c.name for c in kept if c.name != "creep"] == names
+    assert kept[0].name == names[0]
+    assert "creep" in [c.name for c in kept]
 
 
 @pytest.mark.study

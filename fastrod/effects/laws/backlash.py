@@ -17,8 +17,8 @@ from fastrod.types import Floats
 class Backlash(Operator):
     """Play of gears and of tendons in their holes.
 
-    Equation: p = max(l - w, min(l + w, p)), at first l + w z; rounded corners are the mean over half widths
-    w (1 - c), w, w (1 + c)
+    Equation: p = max(l - w, min(l + w, p)), at first l + w start; rounded corners are the mean over half
+    widths w (1 - c), w, w (1 + c)
     Source: play operator (Visintin 1994); backlash of tendon drives (Palli and Melchiorri)
     Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
     speed
@@ -55,9 +55,9 @@ class Backlash(Operator):
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out, n = dl.copy(), routing.n_drives
         gap, rounding = routing.by_tendon(values[:, :n]), np.repeat(values[:, n : n + 1], dl.shape[2], axis=1)
-        begin = routing.drive_sign * routing.by_tendon(values[:, n + 1 :]) * gap
-        widths = (begin * (1.0 - rounding), begin, begin * (1.0 + rounding))
-        at_first = np.concatenate([dl[:, 0] + each for each in widths], axis=1)
-        memory[:] = np.where(np.isnan(memory), at_first, memory)
+        if (first := np.isnan(memory)).any():
+            begin = routing.drive_sign * routing.by_tendon(values[:, n + 1 :]) * gap
+            ahead = (begin * (1.0 - rounding), begin, begin * (1.0 + rounding))
+            memory[first] = np.concatenate([dl[:, 0] + each for each in ahead], axis=1)[first]
         play(out, memory, gap, rounding)
         return out

@@ -17,8 +17,8 @@ from fastrod.types import Floats
 class Friction(Operator):
     """Dry friction of the tendons along the backbone, growing with the bend as a capstan.
 
-    Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), phi the angle that the
-    tendon wraps, r_j over r e^(-+s)
+    Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), at first -start, phi the
+    angle that the tendon wraps, r_j over r e^(-+s)
     Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato et al. 2015, Palli and
     Melchiorri
     Residual signature: sign of the last direction of motion, saturating with travel; loops that grow with the
@@ -78,9 +78,9 @@ class Friction(Operator):
         presliding, growth, spread = (
             np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (n, n + 1, n + 2)
         )
-        held = -routing.drive_sign * routing.by_tendon(values[:, n + 3 :])
-        at_first = np.concatenate([dl[:, 0], *[held] * SLIDERS], axis=1)
-        memory[:] = np.where(np.isnan(memory), at_first, memory)
+        if (first := np.isnan(memory)).any():
+            held = -routing.drive_sign * routing.by_tendon(values[:, n + 3 :])
+            memory[first] = np.concatenate([dl[:, 0], *[held] * SLIDERS], axis=1)[first]
         elastoplastic(
             out, memory, routing.by_tendon(values[:, :n]), presliding, spread, growth, routing.by_end(wrapped)
         )

@@ -64,7 +64,7 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     """The base model and what was found beside it, predicted on every sample of a log."""
     search, state, names = outcome.search, outcome.state, outcome.names
     samples, rows = log.samples, thinned(log.rows, ALL_AT_ONCE)
-    if search.rod.of_modes:  # each row costs a hundred times as much, and the search saw enough of them
+    if search.rod.of_modes:  # each row costs much more, and the search saw enough of them
         rows = search.samples.rows
     start = outcome.start
     if len(names) > 1:
