@@ -127,7 +127,11 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     held_out = "runs that no fit sees, or RUN@START:END in seconds (default: every fourth stretch)"
     identify.add_argument("--held-out", nargs="+", action="extend", default=[], metavar="RUN", help=held_out)
     identify.add_argument(
-        "--max-effects", type=int, default=4, metavar="K", help="name this many at most (default: 4)"
+        "--max-effects",
+        type=int,
+        default=4,
+        metavar="K",
+        help="name this many at most, 0: fit the base model alone (default: 4)",
     )
     identify.add_argument(
         "--free-camera",
