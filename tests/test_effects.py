@@ -124,7 +124,7 @@ def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
     assert_same(*(run(simulator(r), commands(robot), moving=True) for r in (robot, everything)))
 
 
-@pytest.mark.study(beyond=20)
+@pytest.mark.study(beyond=11)
 @ROBOTS
 @pytest.mark.parametrize("name", NAMES)
 def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: Robot) -> None:
@@ -169,7 +169,7 @@ def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     assert_same(fresh, after, [1], [1])
 
 
-@pytest.mark.study(beyond=5)
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None:
     robots = [having(two_segments(), at_typical(name, two_segments(), times)) for times in (0.0, 1.0, 1.4)]

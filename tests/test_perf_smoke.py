@@ -237,6 +237,7 @@ def test_a_log_that_breaks_is_a_row() -> None:
     assert not score("single", row)
 
 
+@pytest.mark.study
 def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
     tables = measured(capsys, "contact", "--robots", "3")
     steps = tables["contact_steps"]

@@ -204,7 +204,7 @@ def pushed(load: float, call: str, contact: Any = None, **options: Any) -> tuple
     return sim, state
 
 
-@pytest.mark.study(beyond=9)
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("load", [-100.0, -1111.0])
 @pytest.mark.parametrize("options", [{}, {"outputs": "tip"}, {"recover": False}, {"contact": FAR}], ids=str)
 @pytest.mark.parametrize("call", ["step", "settle"])

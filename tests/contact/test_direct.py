@@ -86,7 +86,7 @@ def places(rng, solid, n):
     return np.vstack([rng.uniform(-0.7, 0.7, (n, 3)) * size, (pick * weight[..., None]).sum(axis=1) + away])
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("name", SOLIDS)
 def test_point_agrees_with_brute_force(name):
     rng = np.random.default_rng(1)

@@ -98,7 +98,7 @@ def test_the_normal_is_the_slope_of_the_distance(size):
     assert_allclose(normal[smooth], slope[smooth], rtol=0, atol=1e-5)
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("size", RADII, ids=str)
 def test_points_on_the_planes_of_symmetry_have_their_distance(size):
     a = np.array(size)

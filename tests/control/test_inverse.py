@@ -184,6 +184,7 @@ def test_two_segments_get_to_points_that_one_does_not() -> None:
     assert given.rms_predicted < 1e-6
 
 
+@pytest.mark.study
 def test_it_is_the_same_again() -> None:
     one, other = (plan(with_effects("backlash", "latency"), LAP, RATE, rollouts=3) for _ in range(2))
     assert_array_equal(one.dl, other.dl)
@@ -192,6 +193,7 @@ def test_it_is_the_same_again() -> None:
     assert not one.dl.flags.writeable
 
 
+@pytest.mark.study
 def test_more_rollouts_are_never_worse() -> None:
     found = [plan(with_effects("backlash"), LAP, RATE, rollouts=n).rms_distance for n in (1, 2, 4)]
     assert found == sorted(found, reverse=True)

@@ -47,6 +47,7 @@ def test_the_error_is_fed_back_and_shortened() -> None:
     assert_allclose(J @ tight.rates(q, J, 1e-3 * error, ZERO, 0.01), 3e-3 * error, atol=1e-12)
 
 
+@pytest.mark.study
 def test_the_posture_is_approached_in_the_null_space() -> None:
     q, J, task = case(8)
     posture = np.random.default_rng(9).normal(size=12)

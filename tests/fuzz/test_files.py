@@ -48,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, originals: Originals) -> Pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.study(beyond=6)
 def test_a_damaged_file_is_read_right_or_refused_in_a_sentence(
     kind: str, folder: Path, originals: Originals
 ) -> None:
@@ -303,6 +304,7 @@ MESHES: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize("name", MESHES)
+@pytest.mark.study(beyond=12)
 def test_a_mesh_beyond_the_limits_is_refused_in_a_sentence(
     name: str, tmp_path: Path, capfd: Captured
 ) -> None:
@@ -328,6 +330,7 @@ def test_attributes_beside_the_position_cost_nothing(tmp_path: Path) -> None:
         np.testing.assert_array_equal(mine, its)
 
 
+@pytest.mark.study
 def test_a_file_that_is_read_apart_is_the_same(
     tmp_path: Path, monkeypatch: Any, originals: Originals
 ) -> None:

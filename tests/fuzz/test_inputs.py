@@ -241,6 +241,7 @@ def test_odd_rows_and_arclengths_are_refused_and_change_nothing(rows: Any, what:
     ),
     value=odd_values,
 )
+@pytest.mark.study
 def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
     if name in ("n_robots", "points_per_segment") and isinstance(value, int) and value > 1000:
         return
@@ -315,6 +316,7 @@ class Twins(RuleBasedStateMachine):
             assert differing(one, other) == []
 
 
+@pytest.mark.study
 def test_a_session_with_bad_input_is_the_session_without(tmp_path: Any) -> None:
     from hypothesis.stateful import run_state_machine_as_test
 

@@ -168,7 +168,7 @@ def test_slopes_of_the_base_parameters() -> None:
     assert_slopes(here, here.model, here.theta, 0, own | TENDONS | CAMERA)
 
 
-@pytest.mark.study(beyond=10)
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", [*TENDONS, *CAMERA, *FORCE, *MEMORY])
 def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)

@@ -197,7 +197,7 @@ ASKED = {
 }
 
 
-@pytest.mark.study(beyond=4)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_is_refused_with_a_guess(case: str) -> None:
     make, sentence = REFUSED[case]
@@ -207,7 +207,7 @@ def test_what_cannot_be_is_refused_with_a_guess(case: str) -> None:
     assert "far" in str(caught.value)
 
 
-@pytest.mark.study(beyond=3)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("case", REFUSED | ASKED)
 def test_replay_asks_and_shows(case: str) -> None:
     make, sentence = (REFUSED | ASKED)[case]

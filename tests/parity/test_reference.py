@@ -104,7 +104,7 @@ def test_shoot_is_the_truth_in_passive_mode() -> None:
         assert shape.curvature[0, 0] == pytest.approx(float(row["u0x_1_per_m"]), abs=1e-8)
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("case", [0, 36, 72])
 @pytest.mark.parametrize("method", ["lm", "slsqp", "trust-constr"])
 def test_shoot_is_the_truth_in_paper_mode(case: int, method: Any) -> None:
@@ -238,6 +238,7 @@ def test_a_follower_force_rotates_with_the_tip() -> None:
     assert_allclose(shape.position, dead.position, rtol=0, atol=1e-8)
 
 
+@pytest.mark.study
 def test_extension_is_a_longer_segment() -> None:
     robot = cantilever(extension=(0.0, 0.02))
     shape = shoot(robot, extension=[0.01], tip_force=(0.3, 0.0, 0.0))

@@ -23,7 +23,7 @@ def chain() -> Robot:
     )
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study
 @pytest.mark.parametrize(
     "robot",
     [rod(), rod("passive"), rod(n_tendons=3, bending_stiffness=(0.002, 0.003)), chain()],

@@ -76,7 +76,7 @@ def bare(designed: plant.Inputs) -> np.ndarray:
 
 
 # 0.3 mm is the noise; the catalogue's lens reaches 1 % at the edge of a workspace of 30 mm
-@pytest.mark.study(beyond=9)
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("name", plant.library(1) + plant.OUTSIDE)
 def test_every_effect_moves_the_tip_by_its_size(name: str, designed: plant.Inputs, bare: np.ndarray) -> None:
     moved = plant.pose(designed, plant.draw(3, name))[0] - bare

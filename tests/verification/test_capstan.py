@@ -62,6 +62,7 @@ def test_a_sliding_tendon_has_more_tension_at_its_drive_by_the_capstan(ends: tup
     assert np.abs(free.tip_position - state.tip_position).max() > 2e-4
 
 
+@pytest.mark.study
 def test_a_loop_is_wider_under_a_load_that_tightens_the_tendons() -> None:
     robot = stretching()
     tighter = replace(

@@ -104,7 +104,7 @@ def test_slopes_are_those_of_rod_and_spring_together(stiffness: float) -> None:
         assert_allclose(jacobian[:3, -3 + j], expected, atol=2e-6 * np.abs(expected).max())
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("stiffness", [5.0, 30.0])
 def test_a_log_is_a_simulator_settled_at_every_row(stiffness: float) -> None:
     """At 100 N/m two rows have two balances each, 0.4 and 4 mm apart."""

@@ -74,7 +74,7 @@ def test_the_baseline_solves_the_task(name, seed, single):
     assert not info["lost"]
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("action", ["rate", "displacement"])
 def test_random_actions_leave_numbers_finite_and_within_their_bounds(name, action, single):

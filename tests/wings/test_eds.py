@@ -141,7 +141,7 @@ def test_a_file_is_read_however_it_is_written(drive, writing, tmp_path):
         assert var.pdo_mappable == fact.mappable or (writing == "ends early" and key == (0x6502, 0))
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("how", [{}, {"key": "ParameterValue", "node": "1"}], ids=["EDS", "DCF"])
 def test_a_drive_with_a_makers_file_connects_homes_and_moves(drive, how, write):

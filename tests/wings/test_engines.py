@@ -64,6 +64,7 @@ def test_a_robot_that_states_another_gravity_is_not_mounted(stage, gravity):
     assert stage(stating((0.0, 0.0, -1.62)), gravity=1.62).rod.step().ok[0]
 
 
+@pytest.mark.study(beyond=1)
 def test_a_load_that_no_rod_holds_leaves_the_shape(stage):
     robot = fastrod.load_robot("five_segment_reacher")
     s = stage(robot, axis="x", cubes=[Cube(0.05, 0.1, [0.0, 0.5, 0.5])])
@@ -91,6 +92,7 @@ def test_rod_follows_a_host_that_moves(stage):
     assert_allclose(state.tip_position[0], rest + 20 * s.dt * np.array([0.2, 0.0, 0.1]), atol=1e-6)
 
 
+@pytest.mark.study(beyond=1)
 def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it(stage):
     robot = soft_robot()
     s = stage(robot, axis="z", cubes=[Cube(0.4, 0.0, [0.07 + 0.2, 0.0, 0.1])], friction=0.0)

@@ -49,7 +49,7 @@ def test_every_task_knows_the_common_options(name, options, made):
     assert (terminated | truncated).all() == (options.get("n_steps") == 1 or terminated.all())
 
 
-@pytest.mark.study(beyond=8)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", NAMES)
 def test_difficulty_is_a_number_from_zero_to_one(name, made):
     env = made(name, difficulty=0.0)
@@ -322,6 +322,7 @@ def test_pictures_of_every_environment(name, made):
     assert made(name).render() is None
 
 
+@pytest.mark.study
 def test_a_picture_of_the_same_state_is_the_same() -> None:
     env = SingleEnv("Reach", threads=1, render_mode="rgb_array")
     env.reset(seed=0)

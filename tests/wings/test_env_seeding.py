@@ -42,7 +42,7 @@ def test_an_environment_does_not_know_its_neighbours(name, opened):
     assert not np.array_equal(found[0].observations[0], found[1].observations[0])
 
 
-@pytest.mark.study(beyond=3)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ROD_NAMES)
 def test_three_are_the_first_three_of_seventeen(name: str) -> None:
     few, many = (batch(name, n, n_steps=5) for n in (3, 17))
@@ -91,7 +91,7 @@ def test_a_seed_is_a_rollout_whatever_is_beside_it(name, steps, key, options, op
         assert beside[2].reported.max() > 0.0
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["Catch", "TubeInsert", "BoxExplore", "PickPlace", "DualArm"])
 def test_a_seed_is_a_rollout_whatever_came_before(name, opened):
     fresh, used = (opened(batch(name, 1 if task_class(name).hosted else 2)) for _ in range(2))

@@ -64,7 +64,7 @@ def test_gymnasiums_checker_has_nothing_to_say(name, single):
     assert env.action_space.shape == (env.unwrapped.task.n_actions,)
 
 
-@pytest.mark.study(beyond=9)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines_checker_has_nothing_to_say(name, single):
     why = "stable-baselines3 is not installed: pip install 'fastrod[rl]'"
@@ -224,6 +224,7 @@ def test_actions_beyond_their_bounds_count_as_the_bounds() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.study(beyond=5)
 def test_no_step_before_a_reset(name, opened):
     env = opened(several(name, 2))
     with pytest.raises(InputError, match=r"environment 0 .* reset"):

@@ -168,7 +168,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
 ONCE = ("following error", "clock jump")  # nothing tells that they are still there
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("moment", [0.75, 1.32])
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(

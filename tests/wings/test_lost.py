@@ -13,7 +13,7 @@ from fastrod_envs.single import SingleEnv
 LIGHT, HEAVY = {"gravity.line_density": (0.05, 0.051)}, {"gravity.line_density": (0.1, 0.101)}
 
 
-@pytest.mark.study(beyond=7)
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize(
     ("task", "seed", "randomise"),
     [

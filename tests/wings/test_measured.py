@@ -162,7 +162,7 @@ def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> No
         asl_trunk(path)
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @needs_data
 @pytest.mark.parametrize("name", ["asl_trunk", "ethz_beam", "armlab_tdcr"])
 def test_measured_set_is_a_valid_run_log(name: str, tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ def test_the_held_cube_has_its_weight(scene: type[PickSuction | PickGripper]) ->
     assert_allclose(found[5:], needed[5:], rtol=0.01)  # the first steps take it off the table
 
 
+@pytest.mark.study
 def test_without_suction_nothing_is_lifted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SoftManiSim, "suction_grasp", lambda self, enable=True: None)
     sentence = r"^scene pick_suction: at 1\.\d+ s the cube is 0\.00\d+ m from where it was held: not lifted"

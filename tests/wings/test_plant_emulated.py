@@ -418,7 +418,7 @@ def test_ripple_comes_again_with_every_turn_of_the_drum() -> None:
     assert np.count_nonzero(np.diff(np.sign(np.diff(error)))) >= int(2.0 / tooth)  # up and down in each
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study
 @pytest.mark.parametrize("kind", [*KINDS, "outside"])
 @pytest.mark.parametrize("seed", range(3))
 def test_every_effect_moves_the_tip_by_millimetres(kind: str, seed: int) -> None:

@@ -114,7 +114,7 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
 # what it refuses
 
 
-@pytest.mark.study(beyond=5)
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(
     ("reported", "words"),
     [

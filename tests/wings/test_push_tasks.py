@@ -175,6 +175,7 @@ def test_one_step_an_episode_and_goals_alone(opened):
     assert np.isfinite(reward)
 
 
+@pytest.mark.study
 def test_effects_act_in_the_robot(begun):
     ends = []
     for width in (0.0, 5e-4):

@@ -20,7 +20,7 @@ def test_scene_keeps_to_its_physics(name):
     assert all(np.isfinite(value) for value in figures.values())
 
 
-@pytest.mark.study(beyond=10)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("name", names())
 def test_scene_says_what_it_is(name):
     scene = load(name)
@@ -46,6 +46,7 @@ def test_run_is_ok_from_the_first_input_to_the_last(name):
     assert not states[0].contacts.count.any()
 
 
+@pytest.mark.study
 def test_runs_of_one_scene_are_the_same():
     scene = load("draped")
     (*_, (_, first)), (*_, (_, second)) = scene.run(), scene.run()

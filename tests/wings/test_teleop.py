@@ -64,7 +64,7 @@ def test_bends_and_extensions_stay_within_their_ranges() -> None:
     assert teleop.goals.action[6] == 0.0  # this robot does not extend
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("goal", [(0.10, 0.05, 0.40), (-0.15, 0.0, 0.35), (0.0, 0.2, 0.3)])
 def test_a_drag_brings_the_tip_there(goal: tuple[float, float, float]) -> None:
     world, teleop = piloted()

@@ -132,7 +132,7 @@ def test_eye_repeats_by_its_seed():
     assert (first.astype(float) - clean).std() == pytest.approx(2.0, rel=0.05)
 
 
-@pytest.mark.study(beyond=3)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["straight", "bent"])
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0])
 def test_clean_pictures_have_no_bias(camera, tilt):

@@ -98,7 +98,7 @@ def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
     world.disconnect()
 
 
-@pytest.mark.study(beyond=7)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("seed", range(10))
 def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed, opened):
     stage = opened(Exploration(Box(), seed, Explore.dt))
@@ -121,6 +121,7 @@ def test_starts_differ(opened):
     assert min(np.abs(a - b).max() for a, b in combinations(starts, 2)) > 0.05
 
 
+@pytest.mark.study
 def test_held_joints_stay_while_the_soft_robot_looks_around(opened):
     stage = opened(Exploration(Box(), 3, Explore.dt))
     stage.q = stage.arm.solve(stage.flange(INSIDE), stage.q)

@@ -115,7 +115,7 @@ def test_script_begins_again_after_its_end():
     assert_allclose(tip(world), first, atol=1e-12)
 
 
-@pytest.mark.study(beyond=3)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     "robot",
     [*map(load_robot, robot_names()), *map(heavy, ("tendon_length", "passive", "tendon_tension"))],
