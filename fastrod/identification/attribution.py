@@ -25,6 +25,7 @@ from fastrod.identification.search.model_selection import Candidate, ModelState,
 from fastrod.identification.search.motion import HORIZONS, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
+from fastrod.identification.search.structure import is_asked_for, one_sided
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.solver.motion import solver_of
@@ -40,6 +41,7 @@ _MIN_GAIN = (
 )
 # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _SPARE = 2
+_LESS = 0.9  # of what effects leave: a robot of other tendons that leaves less is the one to go on with
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -87,18 +89,36 @@ def identify(
     if reading.refusal:
         raise LogError(reading.refusal)
     moved = reading.registration is not None
-    seen = robot if reading.registration is None else reading.registration.on(robot)
-    model = base_model(seen, free_camera=free_camera, registered=moved)
+
+    def model_of(robot: Robot) -> Model:
+        seen = robot if reading.registration is None else reading.registration.on(robot)
+        return base_model(seen, free_camera=free_camera, registered=moved)
+
     progressed("base fit", 0, most)
-    base = fit_base(some, log.rows, model, robot, frozenset(exclude), threads)
+    base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads)
     check_motion(base, reading.guess)
     progressed(base.sentence, 0, most)
-    candidates = _candidates(base, max_effects, progressed)
-    outcome = _needed(base, candidates, max_effects)
+
+    def rebuilt(log: SplitLog, base: BaseFit) -> tuple[SplitLog, BaseFit]:
+        progressed("tendons that can only pull", 0, most)
+        log, base = one_sided(log, base, _SEARCH_ROWS_OF_MODES, model_of, threads)
+        if base.without is not None:
+            progressed(f"tendons that can only pull: {base.sentence}", 0, most)
+        return log, base
+
+    if max_effects and is_asked_for(base):
+        log, base = rebuilt(log, base)
+    outcome = _needed(base, _candidates(base, max_effects, progressed), max_effects)
+    left = replace(base, start=outcome.state).left
+    if max_effects and base.without is None and is_asked_for(base, left):
+        log_of_other, other = rebuilt(log, base)
+        if other.without is not None and other.left < _LESS * left:
+            log, base = log_of_other, other
+            outcome = _needed(base, _candidates(base, max_effects, progressed), max_effects)
     progressed("prediction on all samples", most - 1, most)
     remaining = residual_structure(
-        some,
-        model.wiring,
+        base.search.samples,
+        base.start.model.wiring,
         outcome.last.fit.residual,
         noise_lag1=base.noise.lag1,
         correlation=base.search.row_correlation,
@@ -113,7 +133,11 @@ def identify(
         at = between(robot, result.identified)
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
-    return replace(result, network=residual_network(log.samples, model.wiring, result)) if network else result
+    return (
+        replace(result, network=residual_network(log.samples, base.start.model.wiring, result))
+        if network
+        else result
+    )
 
 
 def _in_motion(

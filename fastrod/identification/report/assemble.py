@@ -17,11 +17,13 @@ from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.verdict import AT_A_PRICE, CLEAN, VerdictGrounds, choose_verdict, strained
-from fastrod.identification.search.base import SEEN, BaseFit, search_on
+from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.search import Search, SearchOutcome
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
+from fastrod.identification.search.structure import NAME as ONE_SIDED
+from fastrod.identification.search.structure import SLACK, OneSidedTendons
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
@@ -35,6 +37,7 @@ _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outli
 _SAY_LIMITS = 0.05
 _SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
 _WORTH_SAYING = 0.03
+_NUMBERS_OF_TENDONS = {"compliance", "pretension", "axial_stiffness"}
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
@@ -54,8 +57,9 @@ class Explained:
     test: Flags
     """(n,) each."""
     before: Floats
+    bare: Floats
     after: Floats
-    """(n, 3) predicted tip [m], both."""
+    """(n, 3) predicted tip [m]: of the robot as it was given, of the base model, and with effects."""
     train_error: Error
     test_error: Error
 
@@ -76,8 +80,9 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
         # with its own weights: what the base model does not explain must not push its parameters
         again = search_on(piece, base, base.search.target.sigma, state).again(start)
         start = _nearer(start, again, piece, base)
-    before = _everywhere(start, samples, base)
-    after = _everywhere(state, samples, base) if names else before
+    bare = _everywhere(start, samples, base)
+    before = _as_given(base) if base.without else bare
+    after = _everywhere(state, samples, base) if names else bare
     measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
     residual = np.asarray(samples.log.tip_position) - after
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
@@ -89,7 +94,7 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
         error_of(samples, before, after, which, every, length)
         for which, every in ((used, measured & ~log.tested), (test, tested))
     )
-    return Explained(search, start, state, names, outlier, used, test, before, after, *errors)
+    return Explained(search, start, state, names, outlier, used, test, before, bare, after, *errors)
 
 
 def _flags_moved(search: Search, state: ModelState, base: BaseFit) -> bool:
@@ -103,17 +108,20 @@ def verdict_on(
     base: BaseFit, outcome: SearchOutcome, explained: Explained, remaining: ResidualStructure
 ) -> VerdictGrounds:
     """The verdict on what was found, and what remains."""
-    library = _square(outcome.state)
+    library, given = _square(outcome.state), base.without or base
     floor, error = base.noise.floor, explained.test_error
     return choose_verdict(
-        base=_square(base.start),
+        base=_square(given.start),
         library=library,
         after=min(library, _square(outcome.last)),
         left_out=max(0.0, error.after**2 - _SURE * floor**2) / max(error.before**2 - floor**2, 1e-30),
         floor=floor**2,
         structure=remaining,
         steps=outcome.steps,
-        found=[_spoken(name, explained.state.model) for name in explained.names],
+        found=[
+            *(["tendons that can only pull"] if base.without else []),
+            *(_spoken(name, explained.state.model) for name in explained.names),
+        ],
         held_out=(error.before, error.after),
         at_floor=_at_floor(base.noise, explained, remaining),
     )
@@ -145,18 +153,16 @@ def assemble(
     before, after, path = explained.before, explained.after, _path(explained, log, base)
     train_error, test_error = explained.train_error, explained.test_error
     if not kept:
-        after = before
-        train_error, test_error = (replace(e, after=e.before) for e in (train_error, test_error))
-        whole = _distance(samples, before, samples.log.measured & log.tested)
-        test_error = replace(
-            test_error,
-            interval=interval_of(samples, before, explained.test, noise.model.length),
-            all_rows=float(np.sqrt(whole.mean())) if len(whole) else float("nan"),
-        )
-        path = path[:1]
+        after, path, length = explained.bare, path[: 2 if base.without else 1], noise.model.length
+        measured = samples.log.measured
+        train_error = error_of(samples, before, after, explained.used, measured & ~log.tested, length)
+        test_error = error_of(samples, before, after, explained.test, measured & log.tested, length)
     estimates, correlation = estimates_of(final.model, final.fit)
     classes = _classes(steps, kept)
     effects = [_effect(name, final.model, estimates, classes, path, steps, noise.floor) for name in kept]
+    if base.without:
+        effects = [_other_tendons(base, estimates, path, noise.floor), *effects]
+        estimates = {name: e for name, e in estimates.items() if name not in effects[0].parameters}
     wiring = final.model.wiring
     lacks = (
         advice.missing_excitation(explained.search.samples, wiring.bend(np.asarray(samples.log.dl)))
@@ -247,6 +253,41 @@ def _own(state: ModelState, name: str) -> float:
     return float(((with_it - without) ** 2).sum())
 
 
+def _as_given(base: BaseFit) -> Floats:
+    """(n, 3) predicted tip of every sample [m] of the robot as it was given, with its own parameters
+    fitted."""
+    given = base.without or base
+    return _everywhere(given.start, given.search.samples, given)
+
+
+def _other_tendons(
+    base: BaseFit, estimates: dict[str, Estimate], path: list[SearchStage], floor: float
+) -> Found:
+    """The tendons that the robot file did not have, as something that the model lacked."""
+    asked = _NUMBERS_OF_TENDONS if base.without is None else _NUMBERS_OF_TENDONS - _fitted(base.without)
+    best = next(rival for rival in base.rivals if _is_taken(rival, base.robot))
+    return Found(
+        name=ONE_SIDED,
+        title=(OneSidedTendons.__doc__ or "").strip().splitlines()[0],
+        parameters={name: e for name, e in estimates.items() if name.rpartition(".")[2] in asked},
+        held_out_gain=(path[0].held_out ** 2 - path[1].held_out ** 2)
+        / max(path[0].held_out ** 2 - floor**2, 1e-18),
+        evidence={"z": best.z, "bic": best.bic_gain, "loss_share": best.fraction},
+        cannot_be_told_from=[],
+    )
+
+
+def _fitted(base: BaseFit) -> set[str]:
+    """Kinds of parameters that the file asks for."""
+    return {target.rpartition(".")[2] for target in base.robot.fit}
+
+
+def _is_taken(rival: Rival, robot: Robot) -> bool:
+    """Whether a robot with other tendons is this one."""
+    shortens = any(math.isfinite(s.axial_stiffness) for s in robot.segments)
+    return rival.name == (ONE_SIDED if shortens else SLACK)
+
+
 def _spoken(name: str, model: Model) -> str:
     drive = model.drive_of(name)
     return name if drive is None else f"{name} of drive {drive + 1}"
@@ -297,7 +338,18 @@ def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
     scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((base.search.target.sigma**2).sum()))
     alike = dict.fromkeys(step.rivals, "explains as much: this log cannot tell them apart") if kept else {}
     rejected = "another explains more" if kept else "not certain beside what this test does not explain"
-    made = []
+    made = [
+        Tried(
+            name=rival.name,
+            held_out_rms=rival.left,
+            score=rival.z,
+            bic_gain=rival.bic_gain,
+            kept=(taken := base.without is not None and _is_taken(rival, base.robot)),
+            why=f"{'kept: ' if taken else ''}{rival.what}",
+            kind="tendons",
+        )
+        for rival in base.rivals
+    ]
     for c in sorted(step.candidates, key=lambda c: (c.state is None, -c.bic_gain)):
         left = float("nan")
         if c.state is not None and step.before.losses.sum() > 0.0:
@@ -403,6 +455,10 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
         return SearchStage(name=name, train=errors[0], held_out=errors[1])
 
     stages, noise = [stage("base", explained.start)], base.noise.sigma
+    if base.without:
+        errors = explained.train_error.before, explained.test_error.before
+        given = SearchStage(name="base", train=errors[0], held_out=errors[1])
+        stages = [given, replace(stages[0], name=ONE_SIDED)]
     # as the search finds them: taken away from the whole model one by one, effects that correct each other
     # leave a fit that starts far from where it should end
     search, piece = explained.search.weighed(explained.start, noise)

@@ -291,6 +291,8 @@ def _coded(key: str, text: str) -> str:
 
 
 def _kind(kind: str) -> str:
+    if kind == "tendons":
+        return '<span class="chip plain">base model</span>'
     return "" if kind == "effect" else f'<span class="chip plain">pattern: {escape(kind)}</span>'
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fastrod.effects.base import Signal, get_effect, signal_of
 from fastrod.identification.report.result import Found, Result
+from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.model.routing import route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Ints
@@ -71,6 +72,8 @@ class Signals:
 
     def view(self, found: Found) -> SignalView:
         """The residual against what explains this effect."""
+        if found.name == ONE_SIDED:
+            return self._over_bend()
         signal = signal_of(get_effect(found.name))
         if signal is Signal.TIME:
             return self._best([("time since the start of the run [s]", self.time)], self._axes())

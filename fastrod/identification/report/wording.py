@@ -9,6 +9,8 @@ import re
 
 from fastrod.effects.base import get_effect, trait
 from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.structure import NAME as ONE_SIDED
+from fastrod.identification.search.structure import OneSidedTendons
 
 NOTHING = "–"
 VERDICTS = {
@@ -124,8 +126,9 @@ def plain_name(name: str) -> str:
 
 
 def law(name: str) -> dict[str, str]:
-    """Equation, Source and Residual signature of an effect, from its docstring."""
-    text = inspect.cleandoc(type(get_effect(name)).__doc__ or "")
+    """Equation, Source and Residual signature of an effect, or of other tendons, from its docstring."""
+    what = OneSidedTendons if name == ONE_SIDED else type(get_effect(name))
+    text = inspect.cleandoc(what.__doc__ or "")
     found = re.findall(
         r"^(Equation|Source|Residual signature): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE
     )

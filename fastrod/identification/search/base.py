@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -27,6 +28,22 @@ _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Rival:
+    """Another base model, fitted to the same rows."""
+
+    name: str
+    what: str
+    """In words."""
+    left: float
+    """Distance rms that it leaves on held-out blocks [m]."""
+    z: float
+    """Of what it gains on them."""
+    bic_gain: float
+    fraction: float
+    """Of the loss of the base model as it was given that it takes away."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BaseFit:
     """The base model, fitted to what the search looks at: what every candidate stands beside."""
 
@@ -39,32 +56,49 @@ class BaseFit:
     fixed: dict[str, Estimate]
     """Parameters that this log cannot see; they stay nominal."""
     notes: tuple[str, ...]
+    without: BaseFit | None = None
+    """The base fit of the robot as it was given, where this is one of other tendons (`structure`)."""
+    rivals: tuple[Rival, ...] = ()
+    """Base models of other tendons that were tried."""
+
+    @property
+    def left(self) -> float:
+        """Distance of the tip that the base model leaves, once its own parameters are fitted, rms [m]."""
+        off = self.start.fit.residual[:, :3] * self.search.target.sigma
+        counted = off[np.any(off != 0.0, axis=1)]
+        return float(np.sqrt((counted**2).sum(1).mean())) if len(counted) else 0.0
 
     @property
     def sentence(self) -> str:
-        """What the base model leaves of the tip, once its own parameters are fitted."""
-        off = self.start.fit.residual[:, :3] * self.search.target.sigma
-        counted = off[np.any(off != 0.0, axis=1)]
-        rms = float(np.sqrt((counted**2).sum(1).mean())) if len(counted) else 0.0
-        return f"base fit: {1e3 * rms:.3g} mm left of a noise of {1e3 * self.noise.floor:.2g} mm"
+        """That in words."""
+        return f"base fit: {1e3 * self.left:.3g} mm left of a noise of {1e3 * self.noise.floor:.2g} mm"
 
 
 def fit_base(
-    samples: LogSamples, rows: Ints, model: Model, robot: Robot, excluded: frozenset[str], threads: int | None
+    samples: LogSamples,
+    rows: Ints,
+    model: Model,
+    robot: Robot,
+    excluded: frozenset[str],
+    threads: int | None,
+    like: BaseFit | None = None,
 ) -> BaseFit:
     """The base model with its own parameters fitted at the rows of `samples`; those that this log cannot see
     stay nominal, with the reason. `rows` are all that may be fitted; effects `excluded` are for the search to
-    leave out."""
+    leave out. With the base model `like`, of the same log, the fit begins where that one ended; at the same
+    rows noise and outliers are that one's."""
     search = _search(samples, robot, excluded, threads)
     target, notes = search.target, list[str]()
-    linearised = LinearisedModel(model, model.start, samples, search.rod, target)
+    theta = like.start.from_here(model) if like else model.start
+    linearised = LinearisedModel(model, theta, samples, search.rod, target)
     if not linearised.pose.ok.all():
         lost = int((~linearised.pose.ok).sum())
         notes.append(
             f"the model did not converge on {lost} of {len(linearised.pose.ok)} rows; they do not count"
         )
     raw = target.tip - linearised.pose.position
-    noise = _noise(samples.on(rows[:_FOR_NOISE]), model, robot, threads)
+    rival = like is not None and np.array_equal(like.search.samples.rows, samples.rows)
+    noise = like.noise if like and rival else _noise(samples.on(rows[:_FOR_NOISE]), model, robot, threads)
     given = robot.sensor.get("noise", 0.0)
     declared = float(max(given) if isinstance(given, tuple) else given)
     if declared > 0.0:
@@ -72,22 +106,25 @@ def fit_base(
             noise, sigma=np.full(3, declared), how="the robot file's [sensor] noise", uncertainty=0.0
         )
     good = keep(samples, np.nan_to_num(raw), noise) & linearised.pose.ok
+    if like and rival:
+        good = (like.search.target.weight > 0.0) & linearised.pose.ok
     out = int((~good).sum())
     if out > 0.005 * len(raw):
         notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
     target = replace(target, weight=good.astype(float)).weighed(noise.sigma, noise.sigma)
     fixed = _unseen(linearised.under(target), noise.row_correlation(samples))
-    model = replace(model, unknowns=tuple(u for u in model.unknowns if u.name not in fixed))
+    seen = [u.name not in fixed for u in model.unknowns]
+    model, theta = replace(model, unknowns=tuple(compress(model.unknowns, seen))), theta[seen]
     size = max(1.0, rms(target.residual(linearised.pose)))
     search = replace(search, target=target.weighed(noise.sigma * size, noise.sigma))
-    state = search.start(model, model.start)
-    if noise.model.order and not declared > 0.0:
+    state = search.start(model, theta)
+    if noise.model.order and not declared > 0.0 and not rival:
         every = samples.on(rows[:_FOR_NOISE])
         pose = predict(state.model, state.theta, every, PredictedRod(every, robot, threads=threads))
         left = np.asarray(every.log.tip_position)[every.rows] - pose.position
         noise = read_everywhere(every.on(every.rows[pose.ok]), left[pose.ok], noise)
     search = replace(search, noise=noise.sigma, row_correlation=noise.row_correlation(samples))
-    for _ in range(2):
+    for _ in range(1 if like else 2):
         search, state = search.weighed(state, noise.sigma)
     if search.rod.of_modes:  # where the last step has led, solved
         state = search.refined(state, iterations=0)
@@ -131,8 +168,8 @@ def _unseen(linearised: LinearisedModel, correlation: Floats) -> dict[str, Estim
     And stiffnesses that nobody put into `[fit]`, where no load is known: what the tendons' stretch would show
     of them, any gain of the drives shows as well."""
     model, samples = linearised.model, linearised.samples
-    r = linearised.residual(model, model.start)
-    J = linearised.slopes(model, model.start, r)
+    r = linearised.residual(model, linearised.theta)
+    J = linearised.slopes(model, linearised.theta, r)
     _, sd = model.prior
     fixed, requested = {}, set(model.robot.fit)
     spread = covariance_of(J, 1.0 / sd**2, correlation) if len(sd) else np.zeros((0, 0))

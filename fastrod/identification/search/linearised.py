@@ -145,6 +145,15 @@ class LinearisedModel:
         made.target = target
         return made
 
+    def borrowing(self, other: LinearisedModel) -> LinearisedModel:
+        """This model with the slopes of `other`, at a place nearby of the same samples: as many rods as it
+        has unknowns are not solved."""
+        self._columns = dict(other._columns)
+        for name in ("by_length", "by_force"):
+            if name in vars(other):
+                vars(self)[name] = vars(other)[name]
+        return self
+
     def _difference(self, pose: PredictedPose) -> Floats:
         """(n, 6 + 3k) from the reference: tip, rotation vector, points."""
         rotation = pose.rotation @ np.swapaxes(self.pose.rotation, 1, 2)

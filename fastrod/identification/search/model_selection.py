@@ -47,6 +47,14 @@ class ModelState:
         """(p,) fitted numbers of the model's unknowns, without the alternative patterns' amplitudes."""
         return self.fit.theta[: len(self.model.unknowns)]
 
+    def from_here(self, model: Model) -> Floats:
+        """(p,) where a fit of another model of the same robot begins: its numbers of the same name and unit
+        as they are here."""
+        known = {(u.name, u.unit): number for u, number in zip(self.model.unknowns, self.theta, strict=True)}
+        return np.array(
+            [known.get((u.name, u.unit), start) for u, start in zip(model.unknowns, model.start, strict=True)]
+        )
+
     @property
     def columns(self) -> Floats:
         """(n, n_out, k) of the accepted alternative patterns."""

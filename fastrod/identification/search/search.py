@@ -88,11 +88,15 @@ class Search:
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
         from there ends."""
-        return self.refined(self._fitted(model, theta, np.zeros(0), (), iterations))
+        first = self._fitted(model, theta, np.zeros(0), (), iterations)
+        return self.refined(first, borrow=self.rod.of_modes)
 
-    def refined(self, state: ModelState, iterations: int = 4) -> ModelState:
-        """The same with the rod solved at the state's own parameters."""
+    def refined(self, state: ModelState, iterations: int = 4, *, borrow: bool = False) -> ModelState:
+        """The same with the rod solved at the state's own parameters; with `borrow` its slopes are those of
+        the last solution."""
         linearised, theta = self._solved(state)
+        if borrow:
+            linearised = linearised.borrowing(state.linearised)
         fit = self._fit(
             linearised, state.model, theta, state.fit.theta[len(theta) :], state.alternatives, iterations
         )
@@ -127,7 +131,7 @@ class Search:
         sigma = self.target.sigma
         size = max(rms(state.fit.residual), float((noise / sigma).max()))
         search = replace(self, target=self.target.weighed(sigma * size, noise))
-        return search, search.refined(search.refined(state))
+        return search, search.refined(search.refined(state), borrow=self.rod.of_modes)
 
     def again(self, state: ModelState) -> ModelState:
         """A state of other samples, fitted to these; alternative patterns, which belong to their samples, are
@@ -363,7 +367,12 @@ class Search:
             b[: len(state.fit.theta)] = 0.0
             step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
             residual = state.fit.residual - slopes @ step
-            theta = np.concatenate([state.fit.theta, np.zeros(alternative.columns.shape[-1])]) + step
+            low, high = state.model.limits
+            own = np.clip(
+                state.theta + step[: len(low)], low, high
+            )  # a line leads beyond what a robot can be
+            theta = np.concatenate([own, state.fit.theta[len(low) :], np.zeros(columns.shape[-1])])
+            theta[len(low) :] += step[len(low) :]
             fit = Fit(
                 theta,
                 residual,
@@ -459,11 +468,13 @@ class Search:
         exact = {}
         for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None
-            exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
+            refined = self.refined(candidate.state, borrow=self.rod.of_modes)
+            exact[candidate.name] = self.judged(state, refined, candidate.name)
         best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
-                exact[name] = self.judged(state, self.refined(candidate.state), name)
+                refined = self.refined(candidate.state, borrow=self.rod.of_modes)
+                exact[name] = self.judged(state, refined, name)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = best_of(passing)
