@@ -41,7 +41,9 @@ _MIN_GAIN = (
 )
 # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _SPARE = 2
-_LESS = 0.9  # of what effects leave: a robot of other tendons that leaves less is the one to go on with
+# of what the best single effect leaves, and of what all leave that were found: a robot of other tendons that
+# leaves less is the one to go on with
+_MUCH_LESS, _LESS = 0.6, 0.9
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -99,22 +101,25 @@ def identify(
     check_motion(base, reading.guess)
     progressed(base.sentence, 0, most)
 
-    def rebuilt(log: SplitLog, base: BaseFit) -> tuple[SplitLog, BaseFit]:
+    def other_tendons(base: BaseFit, left: float, less: float) -> tuple[SplitLog, BaseFit]:
+        """The log and the base fit of tendons that can only pull, where effects leave much and these
+        less."""
+        if not is_asked_for(base, left):
+            return log, base
         progressed("tendons that can only pull", 0, most)
-        log, base = one_sided(log, base, _SEARCH_ROWS_OF_MODES, model_of, threads)
-        if base.without is not None:
-            progressed(f"tendons that can only pull: {base.sentence}", 0, most)
-        return log, base
+        found = one_sided(log, base, _SEARCH_ROWS_OF_MODES, model_of, threads, less * left)
+        if found[1].without is not None:
+            progressed(f"tendons that can only pull: {found[1].sentence}", 0, most)
+        return found
 
-    if max_effects and is_asked_for(base):
-        log, base = rebuilt(log, base)
-    outcome = _needed(base, _candidates(base, max_effects, progressed), max_effects)
-    left = replace(base, start=outcome.state).left
-    if max_effects and base.without is None and is_asked_for(base, left):
-        log_of_other, other = rebuilt(log, base)
-        if other.without is not None and other.left < _LESS * left:
-            log, base = log_of_other, other
-            outcome = _needed(base, _candidates(base, max_effects, progressed), max_effects)
+    # beside the best single effect, which may be all; then beside all that were found
+    first = _first(base, progressed, most) if max_effects else None
+    log, base = other_tendons(base, _left(base, first), _MUCH_LESS) if first else (log, base)
+    outcome = _searched(base, max_effects, progressed, None if base.without else first)
+    if base.without is None and max_effects:
+        log, base = other_tendons(base, replace(base, start=outcome.state).left, _LESS)
+        if base.without:
+            outcome = _searched(base, max_effects, progressed)
     progressed("prediction on all samples", most - 1, most)
     remaining = residual_structure(
         base.search.samples,
@@ -160,11 +165,33 @@ def _in_motion(
     return assemble_motion(log, robot, found, threads)
 
 
+def _first(base: BaseFit, progressed: Callable[[str, int, int], None], most: int) -> SearchStep:
+    """The first stage of the search."""
+    return replace(base.search, report=lambda name: progressed(name, 1, most)).stage(base.start)
+
+
+def _left(base: BaseFit, step: SearchStep) -> float:
+    """Distance that the best single effect leaves, rms [m]; that of the base model where none passes."""
+    taken = step.taken
+    found = taken is not None and taken.state is not None and taken.alternative is None
+    return replace(base, start=taken.state).left if found and taken and taken.state else base.left
+
+
+def _searched(
+    base: BaseFit,
+    max_effects: int,
+    progressed: Callable[[str, int, int], None],
+    first: SearchStep | None = None,
+) -> SearchOutcome:
+    """What the search finds beside a base model, and needs."""
+    return _needed(base, _candidates(base, max_effects, progressed, first), max_effects)
+
+
 def _candidates(
-    base: BaseFit, max_effects: int, progressed: Callable[[str, int, int], None]
+    base: BaseFit, max_effects: int, progressed: Callable[[str, int, int], None], first: SearchStep | None
 ) -> SearchOutcome:
     """Effects and alternative patterns that explain the residual of the base model, in the order in which
-    they were found."""
+    they were found; the `first` stage may be known."""
     most = max_effects + _SPARE
     search, state, known = base.search, base.start, base.start.model.effects
     names, steps = list[str](), list[SearchStep]()
@@ -174,7 +201,7 @@ def _candidates(
             progressed(name, min(done, most), most + 2)
 
         search = replace(search, report=report)
-        step = search.stage(state)
+        step = first if first and stage == 0 else search.stage(state)
         if step.taken is None and stage == 0:
             step = _pair(search, state, step) or step
         steps.append(step)

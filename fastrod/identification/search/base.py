@@ -64,7 +64,7 @@ class BaseFit:
     @property
     def left(self) -> float:
         """Distance of the tip that the base model leaves, once its own parameters are fitted, rms [m]."""
-        off = self.start.fit.residual[:, :3] * self.search.target.sigma
+        off = self.start.fit.residual[:, :3] * self.start.linearised.target.sigma
         counted = off[np.any(off != 0.0, axis=1)]
         return float(np.sqrt((counted**2).sum(1).mean())) if len(counted) else 0.0
 

@@ -278,10 +278,9 @@ class LinearisedModel:
         at = {u.place: u.inside(float(v)) for u, v in zip(self.model.unknowns, self.theta, strict=True)}
         change = np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1]))
         for unknown, number in zip(model.unknowns, theta, strict=True):
-            if not self._is_light(unknown):
-                change += self.column(unknown) * (
-                    unknown.inside(float(number)) - at.get(unknown.place, unknown.mean)
-                )
+            moved = unknown.inside(float(number)) - at.get(unknown.place, unknown.mean)
+            if moved != 0.0 and not self._is_light(unknown):  # at the reference no slope is needed
+                change += self.column(unknown) * moved
         return change
 
     def _tip_feedback(self, effects: Sequence[Link], tip: Floats) -> tuple[Floats, Floats]:

@@ -32,7 +32,7 @@ NAME, SLACK = "one_sided_tendons", "slack_alone"
 _ROWS = 240  # that the rivals are fitted to; the one that is taken, to as many as any robot of modes
 _LEFT = 0.05  # of the motion: a push-pull model that leaves less is asked for no other tendons
 _FLOORS = 3.0  # of the noise, the same
-_COMMON = 0.02  # of the commands' squares: so much that no bend asks for, and every tendon has its own drive
+_ROUGHLY = 1.5  # times what a fit to a few rows may leave of what one to all is to leave
 _FRACTION = 0.1  # of the loss that another base model must take away
 # Nominal numbers where the file has none, from the bending stiffness: measured robots had a tendon 0.5 to 1
 # times as elastic as a segment that it bends, and a body 5 to 60 times as stiff along its axis as in bending
@@ -55,49 +55,36 @@ class OneSidedTendons:
     """
 
 
-def is_asked_for(base: BaseFit, left: float | None = None) -> bool:
-    """Whether push-pull tendons leave so much that others are to be tried before any effect, and the commands
-    show that they may be others: they hold what no bend asks for, or pull nothing back. Once effects were
-    tried in vain, and `left` [m] with them, commands need not show it."""
-    robot, samples = base.robot, base.search.samples
-    if not (_may_be(robot) and _leaves_much(base, left)):
-        return False
-    if left is not None:
-        return not base.rivals
-    wiring, dl = route(robot), np.asarray(samples.log.dl)[samples.rows]
-    common = dl - wiring.tendon_change(wiring.bend(dl))
-    alone = float((common**2).sum()) > _COMMON * float((dl**2).sum())
-    return alone or bool(_unopposed(robot))
-
-
-def _leaves_much(base: BaseFit, left: float | None = None) -> bool:
-    tip = base.search.target.tip
+def is_asked_for(base: BaseFit, left: float) -> bool:
+    """Whether push-pull tendons and effects leave so much, `left` [m], that other tendons are worth their
+    time; the file says nothing of slack or shortening yet, and two tendons share a segment."""
+    robot, tip = base.robot, base.search.target.tip
     motion = float(np.sqrt(((tip - tip.mean(0)) ** 2).sum(1).mean()))
-    return (base.left if left is None else left) > max(_LEFT * motion, _FLOORS * base.noise.floor)
-
-
-def _may_be(robot: Robot) -> bool:
-    """Whether the file says nothing of slack or shortening yet, and two tendons share a segment."""
     ends = np.bincount(np.asarray(robot.tendon_segment, dtype=int), minlength=1)
     known = any(t.unilateral for t in robot.tendons) or any(
         math.isfinite(s.axial_stiffness) or s.extension != (0.0, 0.0) for s in robot.segments
     )
-    return bool(ends.max(initial=0) >= 2) and not known
+    much = left > max(_LEFT * motion, _FLOORS * base.noise.floor)
+    return bool(ends.max(initial=0) >= 2) and not known and much
 
 
 def one_sided(
-    log: SplitLog, base: BaseFit, most_rows: int, model_of: Callable[[Robot], Model], threads: int | None
+    log: SplitLog,
+    base: BaseFit,
+    most_rows: int,
+    model_of: Callable[[Robot], Model],
+    threads: int | None,
+    below: float,
 ) -> tuple[SplitLog, BaseFit]:
     """The log and the base fit, of a robot with tendons that can only pull where that explains the log better
     than the file's own, and than shortening or stretch alone; else as they are, with what was tried.
-    `model_of` makes the base model of a robot, `most_rows` are those of a fit."""
+    `model_of` makes the base model of a robot, `most_rows` are those of a fit; what leaves more than `below`
+    [m] is not taken."""
     rows = thinned(log.rows, _ROWS)
     given = _timed(base.robot)
     own = fit_base(
         log.samples.on(rows), log.rows, model_of(given), given, base.search.excluded, threads, base
     )
-    if not _leaves_much(own):
-        return log, base
     span = np.abs(np.asarray(log.samples.log.dl)).max()
     rivals, fits = list[Rival](), dict[str, tuple[Robot, SplitLog, BaseFit]]()
     for name, what, robot, columns in _variants(given, float(span)):
@@ -109,7 +96,7 @@ def one_sided(
         )
         rivals.append(_judged(name, what, own, fitted))
         fits[name] = robot, moved, fitted
-        if name == NAME and not _better(rivals[0]):
+        if name == NAME and not (_better(rivals[0]) and rivals[0].left < _ROUGHLY * below):
             break
     best = max(rivals, key=lambda rival: rival.bic_gain)
     if best.name not in (NAME, SLACK) or not _better(best):
@@ -117,6 +104,8 @@ def one_sided(
     robot, moved, fitted = fits[best.name]
     samples = moved.samples.on(thinned(log.rows, most_rows))
     final = fit_base(samples, log.rows, model_of(robot), robot, base.search.excluded, threads, like=fitted)
+    if final.left > below:
+        return log, replace(base, rivals=tuple(rivals))
     return moved, replace(final, without=base, rivals=tuple(rivals))
 
 
