@@ -25,17 +25,18 @@ from fastrod.identification.search.model_selection import Candidate, ModelState,
 from fastrod.identification.search.motion import HORIZONS, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
-from fastrod.identification.search.structure import is_asked_for, one_sided
+from fastrod.identification.search.structure import are_pulled, is_asked_for, one_sided
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.solver.motion import solver_of
 from fastrod.threads import one_blas_thread
 
 MAX_EFFECTS = 4
-# samples that the search looks at; the operators run over all, and what is found is fitted to all. A row of a
-# rod of modes costs more, and such a robot has tens of unknowns, not hundreds
-_SEARCH_ROWS = 1500
-_SEARCH_ROWS_OF_MODES = 500
+# samples that the search looks at; the operators run over all, and what is found is fitted to all. Few are
+# enough where the noise is no limit, and where a row costs more, as of a rod of modes: a robot has tens of
+# unknowns, not hundreds
+_SEARCH_ROWS, _FEW_ROWS = 1500, 500
+_FAR = 10.0  # of the noise: where the base model leaves more, few rows are enough
 _MIN_GAIN = (
     0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
 )
@@ -43,7 +44,7 @@ _MIN_GAIN = (
 _SPARE = 2
 # of what the best single effect leaves, and of what all leave that were found: a robot of other tendons that
 # leaves less is the one to go on with
-_MUCH_LESS, _LESS = 0.6, 0.9
+_MUCH_LESS, _LESS = 0.75, 0.9
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -85,8 +86,7 @@ def identify(
     if dynamics:
         return _in_motion(log, robot, model, progressed, threads)
     progressed("registration", 0, most)
-    most_rows = _SEARCH_ROWS if solver_of([robot], None, False) == "observer" else _SEARCH_ROWS_OF_MODES
-    some = log.samples.on(thinned(log.rows, most_rows))
+    some = log.samples.on(thinned(log.rows, _FEW_ROWS))
     reading = read(some, robot, threads=threads)
     if reading.refusal:
         raise LogError(reading.refusal)
@@ -98,26 +98,30 @@ def identify(
 
     progressed("base fit", 0, most)
     base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads)
+    if base.left < _FAR * base.noise.floor and solver_of([robot], None, False) == "observer":
+        some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
+        base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads, base)
     check_motion(base, reading.guess)
     progressed(base.sentence, 0, most)
 
     def other_tendons(base: BaseFit, left: float, less: float) -> tuple[SplitLog, BaseFit]:
         """The log and the base fit of tendons that can only pull, where effects leave much and these
         less."""
-        if not is_asked_for(base, left):
-            return log, base
         progressed("tendons that can only pull", 0, most)
-        found = one_sided(log, base, _SEARCH_ROWS_OF_MODES, model_of, threads, less * left)
+        found = one_sided(log, base, _FEW_ROWS, model_of, threads, less * left)
         if found[1].without is not None:
             progressed(f"tendons that can only pull: {found[1].sentence}", 0, most)
         return found
 
     # beside the best single effect, which may be all; then beside all that were found
     first = _first(base, progressed, most) if max_effects else None
-    log, base = other_tendons(base, _left(base, first), _MUCH_LESS) if first else (log, base)
+    if first and is_asked_for(base, left := _left(base, first)) and are_pulled(base):
+        log, base = other_tendons(base, left, _MUCH_LESS)
     outcome = _searched(base, max_effects, progressed, None if base.without else first)
     if base.without is None and max_effects:
-        log, base = other_tendons(base, replace(base, start=outcome.state).left, _LESS)
+        left = replace(base, start=outcome.state).left
+        if is_asked_for(base, left) and not base.rivals:
+            log, base = other_tendons(base, left, _LESS)
         if base.without:
             outcome = _searched(base, max_effects, progressed)
     progressed("prediction on all samples", most - 1, most)

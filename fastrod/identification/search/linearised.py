@@ -330,12 +330,15 @@ class LinearisedModel:
             )
         )
 
-    def slopes(self, model: Model, theta: Floats, residual: Floats) -> Floats:
-        """(n, n_out, p) of the prediction, by differences that run only what an unknown moves."""
+    def slopes(self, model: Model, theta: Floats, residual: Floats, known: Floats | None = None) -> Floats:
+        """(n, n_out, p) of the prediction, by differences that run only what an unknown moves; those by the
+        first unknowns may be `known` (n, n_out, < p)."""
         driven, solved = self.driven(model, theta), self.solved(model, theta)
         J = np.empty((*residual.shape, len(theta)))
         _, high = model.limits
-        for j, unknown in enumerate(model.unknowns):
+        n_known = 0 if known is None else known.shape[-1]
+        J[..., :n_known] = 0.0 if known is None else known
+        for j, unknown in enumerate(model.unknowns[n_known:], n_known):
             step = 1e-4 if unknown.log else 1e-3 * unknown.scale
             if unknown.shape or (unknown.place[0] == "effect" and has_memory(get_effect(unknown.place[1]))):
                 step *= 20.0  # operators have corners: look over them
@@ -354,13 +357,13 @@ class LinearisedModel:
             J[..., j] = (residual - self.target.residual(seen)) / step
         return J
 
-    def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
+    def fit(self, model: Model, start: Floats, iterations: int, known: Floats | None = None) -> Fit:
         """The best parameters near here, from `start` (p,) on, within the model's limits and under its
-        priors."""
+        priors; slopes by the first unknowns may be `known`."""
         mean, sd = model.prior
         return minimise(
             lambda theta: self.residual(model, theta),
-            lambda theta, r: self.slopes(model, theta, r),
+            lambda theta, r: self.slopes(model, theta, r, known),
             start,
             mean,
             sd,

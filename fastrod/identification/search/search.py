@@ -165,14 +165,15 @@ class Search:
         amplitudes: Floats,
         found: Sequence[AlternativePattern],
         iterations: int,
+        known: Floats | None = None,
     ) -> Fit:
         """The best parameters near `linearised`, with the amplitudes of alternative patterns as further
-        linear unknowns."""
+        linear unknowns; slopes by the first unknowns may be `known`."""
         n = len(model.unknowns)
         mean, sd = model.prior
         low, high = model.limits
         if not found:
-            return linearised.fit(model, theta, iterations)
+            return linearised.fit(model, theta, iterations, known)
         columns = np.concatenate([f.columns for f in found], axis=-1)
         size = np.sqrt((columns**2).sum((0, 1)))
         wide = _ALTERNATIVE_SD * np.sqrt(linearised.residual(model, theta).size) / np.maximum(size, 1e-12)
@@ -183,7 +184,7 @@ class Search:
             return linearised.residual(model, both[:n]) - columns @ both[n:]
 
         def slopes(both: Floats, at: Floats) -> Floats:
-            own = linearised.slopes(model, both[:n], at + columns @ both[n:])
+            own = linearised.slopes(model, both[:n], at + columns @ both[n:], known)
             return np.concatenate([own, columns], axis=-1)
 
         return minimise(
@@ -277,12 +278,14 @@ class Search:
         promising.sort(key=lambda pair: -pair[0])
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
+        # an effect hardly changes how the model answers to what it had before
+        known, patterns = state.fit.slopes[..., :n], state.alternatives
         fits = [
-            self._fit(linearised, model, theta, amplitudes, state.alternatives, _FEW)
+            self._fit(linearised, model, theta, amplitudes, patterns, _FEW, known)
             for _, theta in promising[:3]
         ]
         best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
-        return self._fit(linearised, model, best, amplitudes, state.alternatives, _MANY)
+        return self._fit(linearised, model, best, amplitudes, patterns, _MANY, known)
 
     def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
         """Loss that the response to the new parameters could take away at best, beside what the others can

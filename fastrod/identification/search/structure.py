@@ -32,6 +32,7 @@ NAME, SLACK = "one_sided_tendons", "slack_alone"
 _ROWS = 240  # that the rivals are fitted to; the one that is taken, to as many as any robot of modes
 _LEFT = 0.05  # of the motion: a push-pull model that leaves less is asked for no other tendons
 _FLOORS = 3.0  # of the noise, the same
+_COMMON = 0.02  # of the commands' squares
 _ROUGHLY = 1.5  # times what a fit to a few rows may leave of what one to all is to leave
 _FRACTION = 0.1  # of the loss that another base model must take away
 # Nominal numbers where the file has none, from the bending stiffness: measured robots had a tendon 0.5 to 1
@@ -66,6 +67,15 @@ def is_asked_for(base: BaseFit, left: float) -> bool:
     )
     much = left > max(_LEFT * motion, _FLOORS * base.noise.floor)
     return bool(ends.max(initial=0) >= 2) and not known and much
+
+
+def are_pulled(base: BaseFit) -> bool:
+    """Whether the commands show that the tendons are not what they seem: they hold what no bend asks for, so
+    that each has a drive of its own, or nothing pulls back what they pull."""
+    wiring, samples = route(base.robot), base.search.samples
+    dl = np.asarray(samples.log.dl)[samples.rows]
+    common = dl - wiring.tendon_change(wiring.bend(dl))
+    return float((common**2).sum()) > _COMMON * float((dl**2).sum()) or bool(_unopposed(base.robot))
 
 
 def one_sided(
