@@ -7,6 +7,7 @@ found effect by effect; those that are needed, on every sample; what still remai
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -44,7 +45,9 @@ _MIN_GAIN = (
 _SPARE = 2
 # of what the best single effect leaves, and of what all leave that were found: a robot of other tendons that
 # leaves less is the one to go on with
-_MUCH_LESS, _LESS = 0.75, 0.9
+_MUCH_LESS, _LESS = 0.8, 0.9
+MOST_SECONDS = 25.0
+"""CPU s of a search, after which it begins no further stage; most logs take 5."""
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -71,7 +74,8 @@ def identify(
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
     `dynamics` replays the log in motion, with inertia and damping, and fits the robot's own parameters alone:
     no effect is tried, the camera's place is not registered, and `free_camera` frees its priors only.
-    Deterministic. Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
+    Deterministic, unless the search stops by time (`MOST_SECONDS`), as a note then says.
+    Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
     if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
         raise InputError(f"max_effects is {max_effects!r}; it must be a whole number, 0 or more.")
@@ -198,8 +202,11 @@ def _candidates(
     they were found; the `first` stage may be known."""
     most = max_effects + _SPARE
     search, state, known = base.search, base.start, base.start.model.effects
-    names, steps = list[str](), list[SearchStep]()
+    names, steps, notes, begun = list[str](), list[SearchStep](), list[str](), time.process_time()
     for stage in range(most + _MORE_STAGES if max_effects else 0):
+        if stage and (taken := time.process_time() - begun) > MOST_SECONDS:
+            notes.append(_stopped(stage, taken))
+            break
 
         def report(name: str, done: int = stage + 1) -> None:
             progressed(name, min(done, most), most + 2)
@@ -207,7 +214,7 @@ def _candidates(
         search = replace(search, report=report)
         step = first if first and stage == 0 else search.stage(state)
         if step.taken is None and stage == 0:
-            step = _pair(search, state, step) or step
+            step = _pair(search, state, step, begun) or step
         steps.append(step)
         if step.taken is None or step.taken.state is None:
             break
@@ -217,20 +224,36 @@ def _candidates(
         if step.taken.alternative is None:
             names += [name for name in state.model.effects if name not in names and name not in known]
     return SearchOutcome(
-        search=search, start=base.start, last=state, state=state, names=tuple(names), steps=tuple(steps)
+        search=search,
+        start=base.start,
+        last=state,
+        state=state,
+        names=tuple(names),
+        steps=tuple(steps),
+        notes=tuple(notes),
+    )
+
+
+def _stopped(stages: int, seconds: float) -> str:
+    """That a search has no time left, and what it has not tried."""
+    tried = "1 effect or pattern was" if stages == 1 else f"{stages} effects or patterns were"
+    return (
+        f"the search stopped by time: {tried} found in {seconds:.0f} CPU s, and what comes beside them was "
+        "not tried"
     )
 
 
 def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> SearchOutcome:
     """The effects that are needed once alternative patterns are gone, with their state."""
     search, state, found, steps = all_found.search, all_found.last, [*all_found.names], [*all_found.steps]
-    alone = base.start
+    alone, begun = base.start, time.process_time()
     if found:
         alone = search.bare(state) if state.alternatives else state
         noise = base.start.fit.residual.size * float((base.noise.sigma**2).mean())
         while (
             state.alternatives
             and len(found) < max_effects
+            and time.process_time() - begun < MOST_SECONDS
             and alone.fit.loss * float((search.target.sigma**2).mean()) > 2.0 * noise
         ):
             step = search.stage(alone, with_alternatives=False)
@@ -259,12 +282,13 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
         state=alone if found else base.start,
         names=tuple(found),
         steps=tuple(steps),
-        notes=(stopped,) if search.spent else (),
+        notes=(*all_found.notes, *([stopped] if search.spent else [])),
     )
 
 
-def _pair(search: Search, state: ModelState, step: SearchStep) -> SearchStep | None:
-    """Two effects at once, where none passes alone: of the five that come nearest."""
+def _pair(search: Search, state: ModelState, step: SearchStep, begun: float) -> SearchStep | None:
+    """Two effects at once, where none passes alone: of the five that come nearest, and as many pairs as the
+    search that has `begun` [CPU s] has time for."""
     near = sorted(
         (c for c in step.candidates if c.state is not None and c.alternative is None and c.fraction > 0.01),
         key=lambda c: -c.fraction,
@@ -273,10 +297,13 @@ def _pair(search: Search, state: ModelState, step: SearchStep) -> SearchStep | N
     for i, one in enumerate(near):
         for other in near[i + 1 :]:
             assert one.state is not None
+            if time.process_time() - begun > MOST_SECONDS:
+                break
             both = search.candidate(one.state, other.name)
             if both.state is None:
                 continue
-            judged = search.judged(state, search.refined(both.state), other.name)
+            solved = search.refined(both.state, borrow=search.rod.of_modes)
+            judged = search.judged(state, solved, other.name)
             if judged.passes and (best is None or judged.bic_gain > best.bic_gain):
                 best = judged
     return None if best is None else replace(step, taken=best)

@@ -124,10 +124,8 @@ def fit_base(
         left = np.asarray(every.log.tip_position)[every.rows] - pose.position
         noise = read_everywhere(every.on(every.rows[pose.ok]), left[pose.ok], noise)
     search = replace(search, noise=noise.sigma, row_correlation=noise.row_correlation(samples))
-    for _ in range(1 if like else 2):
+    for _ in range(2):
         search, state = search.weighed(state, noise.sigma)
-    if search.rod.of_modes:  # where the last step has led, solved
-        state = search.refined(state, iterations=0)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=tuple(notes))
 
 

@@ -93,7 +93,8 @@ class Search:
 
     def refined(self, state: ModelState, iterations: int = 4, *, borrow: bool = False) -> ModelState:
         """The same with the rod solved at the state's own parameters; with `borrow` its slopes are those of
-        the last solution."""
+        the last solution. A rod of modes is solved once more where the fit ends: no slope says where tendons
+        go slack on the way."""
         linearised, theta = self._solved(state)
         if borrow:
             linearised = linearised.borrowing(state.linearised)
@@ -102,7 +103,8 @@ class Search:
         )
         if not np.isfinite(fit.loss):
             return state
-        return self._state(state.model, linearised, fit, state.alternatives)
+        made = self._state(state.model, linearised, fit, state.alternatives)
+        return self.refined(made, 0, borrow=True) if self.rod.of_modes and iterations else made
 
     def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
         """The model solved at a state's parameters, and these. Of a rod of modes, whose tendons go slack

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.effects.pipeline import named_effects
+from fastrod.identification.log.base_model import STIFFNESS_SD
 from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.base import BaseFit, Rival, fit_base
@@ -29,7 +30,7 @@ from fastrod.model.routing import route
 from fastrod.types import Floats
 
 NAME, SLACK = "one_sided_tendons", "slack_alone"
-_ROWS = 240  # that the rivals are fitted to; the one that is taken, to as many as any robot of modes
+_ROWS = 300  # that the rivals are fitted to; the one that is taken, to as many as any robot of modes
 _LEFT = 0.05  # of the motion: a push-pull model that leaves less is asked for no other tendons
 _FLOORS = 3.0  # of the noise, the same
 _COMMON = 0.02  # of the commands' squares
@@ -257,7 +258,19 @@ def _pulling(robot: Robot, span: float, *, paired: bool) -> Robot:
     if not paired:
         fit = {target: prior for target, prior in fit.items() if not target.endswith(".zero")}
     pulled = _with_tendons(robot, unilateral=True, pretension=_PRETENSION * tension)
-    return _elastic(replace(pulled, fit=fit))
+    return _elastic(_stiff_apart(replace(pulled, fit=fit)))
+
+
+def _stiff_apart(robot: Robot) -> Robot:
+    """With a bending stiffness of each segment, where there are several: the tensions of tendons that pass
+    one segment bend the other by it."""
+    if robot.n_segments < 2 or any(
+        re.fullmatch(r"segment\.\d+\.bending_stiffness", target) for target in robot.fit
+    ):
+        return robot
+    mean = float(np.mean([np.mean(s.bending_stiffness) for s in robot.segments]))
+    fit = {"segment.*.bending_stiffness": {"sd": STIFFNESS_SD * mean}}
+    return replace(robot, fit=dict(robot.fit) | fit)
 
 
 def _shortening(robot: Robot) -> Robot:
@@ -268,7 +281,7 @@ def _shortening(robot: Robot) -> Robot:
         for s in robot.segments
     )
     mean = float(np.mean([s.axial_stiffness for s in segments]))
-    fit = dict(robot.fit) | {"segment.*.axial_stiffness": {"sd": _WIDE * mean, "shared": True}}
+    fit = dict(robot.fit) | {"segment.*.axial_stiffness": {"sd": _WIDE * mean}}
     return replace(robot, segments=segments, fit=fit)
 
 
