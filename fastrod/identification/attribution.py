@@ -105,7 +105,6 @@ def identify(
     if base.left < _FAR * base.noise.floor and solver_of([robot], None, False) == "observer":
         some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
         base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads, base)
-    check_motion(base, reading.guess)
     progressed(base.sentence, 0, most)
 
     def other_tendons(base: BaseFit, left: float, less: float) -> tuple[SplitLog, BaseFit]:
@@ -117,8 +116,15 @@ def identify(
             progressed(f"tendons that can only pull: {found[1].sentence}", 0, most)
         return found
 
+    try:
+        check_motion(base, reading.guess)
+    except LogError:  # of tendons that the file has otherwise, it may be
+        if max_effects and is_asked_for(base, base.left) and are_pulled(base):
+            log, base = other_tendons(base, base.left, _MUCH_LESS)
+        if base.without is None:
+            raise
     # beside the best single effect, which may be all; then beside all that were found
-    first = _first(base, progressed, most) if max_effects else None
+    first = _first(base, progressed, most) if max_effects and base.without is None else None
     if first and is_asked_for(base, left := _left(base, first)) and are_pulled(base):
         log, base = other_tendons(base, left, _MUCH_LESS)
     outcome = _searched(base, max_effects, progressed, None if base.without else first)

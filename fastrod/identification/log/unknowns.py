@@ -256,15 +256,19 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             place = number - int(np.searchsorted(nominal.tendon_segment, k))
             tendons = list(segments[k].tendons)
             own = getattr(nominal.tendons[number], kind)
-            new = (
-                now
-                if not isinstance(own, tuple)
-                else tuple(v + now - was if kind == "angle" else v * now / was for v in own)
-            )
+            new = now
+            if isinstance(own, tuple):
+                new = tuple(v + now - was if kind == "angle" else v * now / was for v in own)
+            if kind == "angle":  # a turn more or less is the same
+                new = tuple(map(_in_a_turn, new)) if isinstance(new, tuple) else _in_a_turn(new)
             tendons[place] = replace(tendons[place], **{kind: new})
             # set again when all is known
             segments[k] = replace(segments[k], tendons=tuple(tendons), body_radius=0.0)
     return replace(robot, segments=tuple(segments), log_points=())
+
+
+def _in_a_turn(angle: float) -> float:
+    return angle if abs(angle) <= 2.0 * math.pi else math.remainder(angle, 2.0 * math.pi)
 
 
 def _whole(robot: Robot, nominal: Robot) -> Robot:

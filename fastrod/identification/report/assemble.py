@@ -12,11 +12,11 @@ import numpy as np
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
-from fastrod.identification.log.noise import Noise, keep
+from fastrod.identification.log.noise import keep
 from fastrod.identification.log.split import SplitLog, thinned
-from fastrod.identification.log.unknowns import Model
+from fastrod.identification.log.unknowns import Model, known_model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
-from fastrod.identification.report.verdict import AT_A_PRICE, CLEAN, VerdictGrounds, choose_verdict, strained
+from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -29,6 +29,9 @@ from fastrod.types import Flags, Floats
 
 ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
+_MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
+_MOST_ADVICE = 5  # runs
+_MANY = 0.005  # of the rows: so many outliers are worth a note
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
 _NEAR = 1.1  # of the noise: a held-out error within it is explained
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
@@ -110,6 +113,7 @@ def verdict_on(
     """The verdict on what was found, and what remains."""
     library, given = _square(outcome.state), base.without or base
     floor, error = base.noise.floor, explained.test_error
+    classes, (held_out, n_held_out) = _classes(outcome.steps, explained.names), _held_out(explained)
     return choose_verdict(
         base=_square(given.start),
         library=library,
@@ -120,22 +124,19 @@ def verdict_on(
         steps=outcome.steps,
         found=[
             *(["tendons that can only pull"] if base.without else []),
-            *(_spoken(name, explained.state.model) for name in explained.names),
+            *(_spoken(name, explained.state.model, classes) for name in explained.names),
         ],
         held_out=(error.before, error.after),
-        at_floor=_at_floor(base.noise, explained, remaining),
+        at_floor=held_out <= _NEAR * floor,
+        like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
     )
 
 
-def _at_floor(noise: Noise, explained: Explained, remaining: ResidualStructure) -> bool:
-    """Whether the held-out error is the noise's, as well as both are known, or what is left is white and no
-    larger on data held out than on those that were fitted."""
-    train, test = explained.train_error.after, explained.test_error
-    after = test.after if math.isfinite(test.after) else train
-    rows = explained.test if math.isfinite(test.after) else explained.used
-    if after <= max(_NEAR * noise.floor, noise.most(int(rows.sum()))):
-        return True
-    return remaining.structured <= CLEAN and after <= _NEAR * train
+def _held_out(explained: Explained) -> tuple[float, int]:
+    """The error on data held out, or on all where nothing was [m], and its samples."""
+    train, test = explained.train_error.after, explained.test_error.after
+    known = math.isfinite(test)
+    return (test, int(explained.test.sum())) if known else (train, int(explained.used.sum()))
 
 
 def assemble(
@@ -152,6 +153,7 @@ def assemble(
     final = explained.state if kept else explained.start
     before, after, path = explained.before, explained.after, _path(explained, log, base)
     train_error, test_error = explained.train_error, explained.test_error
+    shipped = _shipped(base, explained)
     if not kept:
         after, path, length = explained.bare, path[: 2 if base.without else 1], noise.model.length
         measured = samples.log.measured
@@ -170,7 +172,12 @@ def assemble(
         else []
     )
     recommended = [advice.look_at(pattern) for pattern in grounds.patterns]
-    recommended += [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
+    recommended += [
+        advice.separating_run(e.name, other)
+        for e in effects
+        if e.held_out_gain > _MATTERS
+        for other in e.cannot_be_told_from
+    ]
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept}
     ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
     say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
@@ -203,20 +210,23 @@ def assemble(
         tried=_tried(steps[0], kept, base) if steps else [],
         path=path,
         bounds=explained.search.bounds(final),
-        advice=advice.unique([*recommended, *lacks]),
-        notes=[*base.notes, *outcome.notes, *_left_out(test_error)],
+        advice=advice.unique([*recommended, *lacks])[:_MOST_ADVICE],
+        notes=[*base.notes, *outcome.notes, *_left_out(explained, test_error)],
         solves=base.search.rod.runs,
+        as_given_rms=shipped,
     )
 
 
-def _left_out(error: Error) -> list[str]:
-    """What outliers do to the held-out error, where they do something."""
-    if not error.all_rows > _DIFFERS * error.after:
-        return []
-    return [
-        f"outliers of what is left do not count; with them the held-out error is "
-        f"{1e3 * error.all_rows:.3g} mm and not {1e3 * error.after:.3g}"
-    ]
+def _left_out(explained: Explained, error: Error) -> list[str]:
+    """How many rows jump beside what was found, and what they do to the held-out error."""
+    n, every = int(explained.outlier.sum()), int(explained.search.samples.log.measured.sum())
+    said = [f"{n} of {every} rows are outliers of what is left and do not count"] * (n > _MANY * every)
+    if error.all_rows > _DIFFERS * error.after:
+        said.append(
+            f"with the rows that jump the held-out error is {1e3 * error.all_rows:.3g} mm and not "
+            f"{1e3 * error.after:.3g}"
+        )
+    return said
 
 
 def _predicted(state: ModelState, piece: LogSamples, base: BaseFit) -> PredictedPose:
@@ -260,6 +270,17 @@ def _as_given(base: BaseFit) -> Floats:
     return _everywhere(given.start, given.search.samples, given)
 
 
+def _shipped(base: BaseFit, explained: Explained) -> tuple[float, float]:
+    """Error of the robot file as it is, nothing fitted, on fitted and on held-out samples [m]."""
+    given = base.without or base
+    samples = given.search.samples.on(np.arange(len(given.search.samples.log)))
+    rod = PredictedRod(samples, given.robot, threads=given.search.rod.threads)
+    pose = predict(known_model(given.robot), np.zeros(0), samples, rod)
+    tip = np.where(pose.ok[:, None], pose.position, np.nan)
+    fitted, held_out = (error_of(samples, tip, tip, rows).before for rows in (explained.used, explained.test))
+    return fitted, held_out
+
+
 def _other_tendons(
     base: BaseFit, estimates: dict[str, Estimate], path: list[SearchStage], floor: float
 ) -> Found:
@@ -288,9 +309,11 @@ def _is_taken(rival: Rival, robot: Robot) -> bool:
     return rival.name == (ONE_SIDED if shortens else SLACK)
 
 
-def _spoken(name: str, model: Model) -> str:
-    drive = model.drive_of(name)
-    return name if drive is None else f"{name} of drive {drive + 1}"
+def _spoken(name: str, model: Model, classes: dict[str, list[str]]) -> str:
+    """An effect in words, with the drive that has it and the others that it may be as well."""
+    drive, others = model.drive_of(name), classes.get(name, [])
+    said = name if drive is None else f"{name} of drive {drive + 1}"
+    return f"{said} (or {' or '.join(others)}: this log cannot say)" if others else said
 
 
 def _effect(
@@ -471,14 +494,15 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
 
 
 def limits(robot: Robot, samples: LogSamples) -> list[str]:
-    """Sentences on shear and inertia, which the rod's state does not hold and no effect can carry, where this
-    robot is thick or slow enough for them."""
+    """What to try where this robot is thick or slow enough for shear or inertia and its file leaves them
+    out."""
     found = []
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
-    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING:
+    sheared = any(math.isfinite(s.shear_stiffness) for s in robot.segments)
+    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING and not sheared:
         found.append(
-            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some "
-            f"{100 * fraction:.0f} % of the deflection"
+            f"shear may be {100 * fraction:.0f} % of the deflection of a body {0.5 / thickest:.1f} times as "
+            "long as thick: give its segments a shear_stiffness, and a [fit] of it"
         )
     mass = sum(s.line_density * s.length for s in robot.segments)
     if mass > 0.0:
@@ -487,8 +511,8 @@ def limits(robot: Robot, samples: LogSamples) -> list[str]:
         steps = sorted(samples.dt[samples.dt > 0.0].tolist())
         if frequency < _SLOW and steps and 2.0 * frequency * steps[len(steps) // 2] < 1.0:
             found.append(
-                f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a "
-                "static model cannot follow"
+                f"it rings near {frequency:.1f} Hz, which a model at rest cannot follow: identify it in "
+                "motion, with --dynamics"
             )
     return found
 

@@ -158,19 +158,17 @@ def table(result: Result) -> Group:
         title=escape("tip error, rms [mm]"),
         title_justify="left",
     )
-    for name in ("", "before", "after", "95 % interval", "noise floor"):
+    for name in ("", "shipped", "base fit", "effects", "95 % interval", "noise floor"):
         errors.add_column(name, justify="right" if name else "left")
     floor = millimetres(result.noise.floor)
     low, high = (millimetres(v) for v in result.test.interval)
-    errors.add_row("train", millimetres(result.train.before), millimetres(result.train.after), "", floor)
-    errors.add_row(
-        "held out",
-        millimetres(result.test.before),
-        millimetres(result.test.after),
-        f"{low} to {high}",
-        floor,
-        style="bold",
-    )
+    shipped = [millimetres(v) for v in result.as_given_rms or (math.nan, math.nan)]
+    for (name, error), given in zip(
+        (("train", result.train), ("held out", result.test)), shipped, strict=True
+    ):
+        interval = f"{low} to {high}" if error is result.test else ""
+        cells = given, millimetres(error.before), millimetres(error.after), interval, floor
+        errors.add_row(name, *cells, style="bold" if interval else None)
     blocks: list[Any] = [title, Text(result.summary), Text(), errors]
     if result.effects:
         grid = Table(

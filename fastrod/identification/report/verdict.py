@@ -55,12 +55,14 @@ def choose_verdict(
     found: Sequence[str],
     held_out: tuple[float, float] = (float("nan"), float("nan")),
     at_floor: bool | None = None,
+    like_noise: bool = False,
 ) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
     `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
     above the noise that is left; `held_out`: that error before and after, rms [m]; `at_floor`: whether it is
-    the noise's, or what is left is white (without it: by the share that is left)."""
+    the noise's (without it: by the share that is left); `like_noise`: whether so few samples of slow noise
+    may be as large."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative
@@ -80,8 +82,8 @@ def choose_verdict(
         else structure.kind
     )
     if not found and not alternatives:
-        white = structure.structured <= CLEAN
-        if white and base > _NO_NOISE * floor:
+        white = structure.structured <= CLEAN or like_noise
+        if white and not like_noise and base > _NO_NOISE * floor:
             times = float(np.sqrt(base / max(floor, 1e-30)))
             said = f"What the model leaves is {times:.3g} times the noise, in no pattern that the test tells."
             return VerdictGrounds("not_in_library", said, "unknown", 1.0, (), False)
@@ -108,9 +110,9 @@ def choose_verdict(
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
     done = left <= _EXPLAINED if at_floor is None else at_floor and foreign <= _EXPLAINED
     if done:
-        more = f" What little remains: {patterns[0]}." if patterns else ""
-        said = f"{_cut(found, held_out, base, library, floor)}.{more}"
-        return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, patterns, False)
+        said = f"{_cut(found, held_out, base, library, floor)}."
+        # at the noise no pattern is told
+        return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, (), False)
     what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
     if foreign > _FOREIGN or left > _PARTLY:
         names = _listed(found)

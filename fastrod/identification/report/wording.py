@@ -17,7 +17,7 @@ VERDICTS = {
     "none": "Nothing is missing",
     "explained": "Explained",
     "partly_explained": "Partly explained",
-    "ambiguous": "Ambiguous on this log",
+    "ambiguous": "Explained, up to a class",
     "not_in_library": "Not in the library",
 }
 _NOUNS = {

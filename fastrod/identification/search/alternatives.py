@@ -9,7 +9,7 @@ effect is fitted from where the scan has found it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -42,6 +42,8 @@ class AlternativePattern:
     """Where the fit of the effect of the same name begins; None where none stands for it in this log."""
     drive: int | None = None
     """The one drive that has the effect, from 0 on."""
+    n_tried: int = 1
+    """Patterns of which this one was chosen: the more there are, the better the best of them fits noise."""
 
 
 def alternatives(linearised: LinearisedModel, tangent: Floats, residual: Floats) -> list[AlternativePattern]:
@@ -54,12 +56,14 @@ def alternatives(linearised: LinearisedModel, tangent: Floats, residual: Floats)
         families += [_bump(linearised), _slip(linearised, solver), _sway(linearised, residual)]
     for family in families:
         best: tuple[float, AlternativePattern] | None = None
+        tried = 0
         for alternative in family:
+            tried += alternative.n_tried
             loss = solver.loss(alternative.columns)
             if best is None or loss < best[0]:
                 best = loss, alternative
         if best is not None:
-            found.append(best[1])
+            found.append(replace(best[1], n_tried=tried))
     return found
 
 
@@ -158,6 +162,7 @@ def _slip(linearised: LinearisedModel, solver: _Projected) -> Iterator[Alternati
         2,
         {"at": at} if one_run else None,  # a time of a run is of that run alone
         drive if one_run and wiring.n_drives > 1 else None,
+        (_TIMES + len(fine)) * wiring.n_drives,
     )
 
 
@@ -187,6 +192,7 @@ def _sway(linearised: LinearisedModel, residual: Floats) -> Iterator[Alternative
                 f"a line at {fine:.3f} Hz that no input has: the base or the camera sways",
                 columns,
                 1,
+                n_tried=len(frequencies),
             )
 
 

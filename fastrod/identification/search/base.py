@@ -108,9 +108,6 @@ def fit_base(
     good = keep(samples, np.nan_to_num(raw), noise) & linearised.pose.ok
     if like and rival:
         good = (like.search.target.weight > 0.0) & linearised.pose.ok
-    out = int((~good).sum())
-    if out > 0.005 * len(raw):
-        notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
     target = replace(target, weight=good.astype(float)).weighed(noise.sigma, noise.sigma)
     fixed = _unseen(linearised.under(target), noise.row_correlation(samples))
     seen = [u.name not in fixed for u in model.unknowns]

@@ -324,6 +324,7 @@ class Search:
         k = len(with_it.fit.theta) - len(state.fit.theta) + (alternative.n_hidden if alternative else 0)
         size = self._worth(with_it)
         gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
+        gain -= 2.0 * float(np.log(alternative.n_tried)) if alternative else 0.0
         z = paired(state.losses, with_it.losses) / blocks_alike(
             self.row_correlation, len(self.block) // N_BLOCKS
         )
