@@ -1,4 +1,4 @@
-"""Measured data of three real robots, each as a `RunLog` and the `Robot` that it was measured on.
+"""Measured data of four real robots, each as a `RunLog` and the `Robot` that it was measured on.
 
 Every adapter turns a published table into SI units and into the robot's base frame: z along the straight rod
 away from the base, right-handed. What the authors publish is used as published; what they do not is
@@ -43,6 +43,17 @@ ASL_PRETENSION = 5.0
 """Nominal [N], of every tendon at rest."""
 ASL_AXIAL_STIFFNESS = (300.0, 400.0, 500.0)
 """Nominal [N], by segment: a hose that the tendons shorten."""
+
+OPENCR_SERVOS = (4, 3, 9, 5, 2, 8, 6, 1, 7)
+"""The servo of each tendon, published."""
+OPENCR_STIFFNESS = 0.0098
+"""Of a steel core of 1 mm at 200 GPa [N m^2]."""
+OPENCR_COMPLIANCE = 4e-5
+"""Nominal [m/N]."""
+OPENCR_PRETENSION = 4.0
+"""Nominal [N]; the authors' fits are 0 to 4 N by segment."""
+OPENCR_AXIAL_STIFFNESS = 2e4
+"""Nominal [N], of the core with its disks between tendons."""
 
 ARMLAB_LENGTH = 0.108
 """Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
@@ -232,8 +243,74 @@ def _armlab_robot() -> Robot:
         name="armlab_tdcr",
         segments=(rod,),
         base_quaternion=_UPSIDE_DOWN,
-        fit={"segment.1.length": {"sd": 0.01}, "tendon.*.offset": {"sd": 0.001, "shared": True}},
-        sensor={"registration_sd": (0.01, 0.05), "noise": ARMLAB_NOISE},
+        fit={
+            "segment.1.length": {"sd": 0.01},
+            "tendon.*.offset": {"sd": 0.001, "shared": True},
+            "tendon.*.gain": {"sd": 0.1},
+            "tendon.*.angle": {"sd": 0.15},
+        },
+        sensor={"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.005, "noise": ARMLAB_NOISE},
+    )
+
+
+def opencr_ftv4(path: str | Path) -> tuple[RunLog, Robot]:
+    """Three segments with nine tendons of the Continuum Robotics Lab, Toronto: single pulls, circles, pairs.
+
+    Frame: as published, z along the straight robot, up to 10 mm and a turn about z off. `t` counts from the
+    first row; rows that repeat were dropped by the authors, so that a hold is a gap in time.
+
+    Published: segment lengths, the tendons' place 4.5 mm off a steel core of 1 mm, which servo pulls which
+    (the columns are in tendon order, three a segment); `dl` = -servo_mm / 1000, measured, each tendon on a
+    servo of its own that can only pull. Read from the first pulls of single tendons and rounded to 30 deg:
+    the tendons' angles. Nominal: bending stiffness of the core (200 GPa), tendon compliance, pretension,
+    axial stiffness; weightless.
+    """
+    table, where = _table(path, "opencr_ftv4"), Path(path).name
+    t = numbers(table, "timestamp", where)
+    log = RunLog(
+        name=Path(path).stem,
+        t=t - t[0],
+        run=np.full(len(t), ""),
+        dl=-_metres(table, [f"servo_{k}_mm" for k in OPENCR_SERVOS], where),
+        tip_position=_metres(table, [f"tip_{axis}" for axis in "xyz"], where),
+    )
+    return log, _opencr_robot()
+
+
+def _opencr_robot() -> Robot:
+    segments = tuple(
+        Segment(
+            length=length,
+            bending_stiffness=(OPENCR_STIFFNESS, OPENCR_STIFFNESS),
+            torsional_stiffness=0.77 * OPENCR_STIFFNESS,
+            axial_stiffness=OPENCR_AXIAL_STIFFNESS,
+            body_radius=0.006,
+            tendons=tuple(
+                Tendon(
+                    offset=0.0045,
+                    angle=math.radians(math.remainder(first + 120.0 * i, 360.0)),
+                    compliance=OPENCR_COMPLIANCE,
+                    pretension=OPENCR_PRETENSION,
+                    unilateral=True,
+                )
+                for i in range(3)
+            ),
+        )
+        for length, first in zip((0.06, 0.0625, 0.064), (180.0, 210.0, 240.0), strict=True)
+    )
+    return Robot(
+        name="opencr_ftv4",
+        segments=segments,
+        fit={
+            "tendon.*.gain": {"sd": 0.1},
+            "tendon.*.angle": {"sd": 0.1},
+            "segment.*.length": {"sd": 0.003},
+            "segment.*.bending_stiffness": {"sd": 0.3 * OPENCR_STIFFNESS},
+            "segment.*.axial_stiffness": {"sd": OPENCR_AXIAL_STIFFNESS},
+            "tendon.*.compliance": {"sd": OPENCR_COMPLIANCE, "shared": True},
+            "tendon.*.pretension": {"sd": 2.0 * OPENCR_PRETENSION},
+        },
+        sensor={"registration_sd": (0.01, 0.1), "latency_sd": 0.15},
     )
 
 
@@ -244,12 +321,14 @@ _HEADERS = {
         *(f"{axis}{k}_mm" for k in (1, 2, 3) for axis in "xyz"),
     ),
     "ethz_beam": ("run", "tip_load_N", "t_s", *(f"tip{k}_{axis}_mm" for k in (1, 2, 3) for axis in "xyz")),
+    "opencr_ftv4": ("timestamp", *(f"servo_{k}_mm" for k in OPENCR_SERVOS), "tip_x", "tip_y", "tip_z"),
     "armlab_tdcr": ("l1_mm", "l2_mm", "l3_mm", "x_mm", "y_mm", "z_mm", "glitch"),
 }
 _ADAPTERS: dict[str, Callable[[str | Path], tuple[RunLog, Robot]]] = {
     "asl_trunk": asl_trunk,
     "ethz_beam": ethz_beam,
     "armlab_tdcr": armlab_tdcr,
+    "opencr_ftv4": opencr_ftv4,
 }
 
 

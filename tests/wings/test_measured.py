@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
 from fastrod.identification.log.base_model import base_model
-from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.runlog import read_log, read_table, write_log
 from fastrod.model.robotfile import dumps, loads
 from fastrod.model.routing import route
 from fastrod_scenes import measured
-from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam
+from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam, opencr_ftv4
 
 DATA = Path(os.environ.get("FASTROD_DATA", Path(__file__).parents[3] / "shared" / "data"))
 needs_data = pytest.mark.skipif(
@@ -164,7 +164,7 @@ def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> No
 
 @pytest.mark.study
 @needs_data
-@pytest.mark.parametrize("name", ["asl_trunk", "ethz_beam", "armlab_tdcr"])
+@pytest.mark.parametrize("name", ["asl_trunk", "ethz_beam", "armlab_tdcr", "opencr_ftv4_train"])
 def test_measured_set_is_a_valid_run_log(name: str, tmp_path: Path) -> None:
     adapter = detect(DATA / f"{name}.csv")
     assert adapter is not None
@@ -207,6 +207,18 @@ def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     assert np.sqrt(np.mean((felt - reported) ** 2)) == pytest.approx(11.5, abs=0.1)
     late = [np.sqrt(np.mean((felt[k:] - reported[: len(reported) - k]) ** 2)) for k in range(12)]
     assert int(np.argmin(late)) > 0
+
+
+@needs_data
+def test_a_servo_of_the_opencr_robot_pulls_the_tip_to_its_tendons_side() -> None:
+    """The first patterns pull one servo at a time: its tendon is the one that the adapter says it is."""
+    path = DATA / "opencr_ftv4_train.csv"
+    (log, robot), patterns = opencr_ftv4(path), np.array(read_table(path)["pattern_label"])
+    for k, servo in enumerate(measured.OPENCR_SERVOS):
+        rows = np.flatnonzero(patterns == f"rep1_tendon{k}_id{servo}_pull")
+        x, y, _ = log.tip_position[rows[np.argmin(log.dl[rows, k])]]
+        turned = math.remainder(math.atan2(y, x) - float(robot.tendons[k].angle), 2.0 * math.pi)
+        assert abs(turned) < math.radians(20.0)
 
 
 @needs_data
