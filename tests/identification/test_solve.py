@@ -14,8 +14,10 @@ from fastrod.identification.search.solve import (
     Fit,
     bic,
     covariance,
+    covariance_of,
     effective_size,
     held_out_losses,
+    least_squares,
     minimise,
     paired,
 )
@@ -284,3 +286,16 @@ def test_the_gain_over_blocks_is_a_t_statistic() -> None:
     mean_alone = (loud - quiet).mean() / ((loud - quiet).std(ddof=1) / np.sqrt(10.0))
     assert mean_alone < 1.1
     assert paired(loud, quiet) > 3.0
+
+
+def test_a_standard_error_goes_with_its_unit() -> None:
+    """An axial stiffness in newtons beside angles in radians: its column is smaller by 10 orders."""
+    rng = np.random.default_rng(4)
+    slopes, unit = rng.normal(size=(50, 3, 4)), np.array([1.0, 1e-10, 1e4, 1.0])
+    plain = covariance_of(slopes, np.ones(4), np.ones(1))
+    scaled = covariance_of(slopes * unit, unit**2, np.ones(1))
+    assert_allclose(scaled * np.outer(unit, unit), plain, rtol=1e-9)
+    gram = np.tensordot(slopes, slopes, ((0, 1), (0, 1)))
+    b = rng.normal(size=4)
+    found = least_squares(gram * np.outer(unit, unit), b * unit)
+    assert_allclose(found * unit, np.linalg.solve(gram, b), rtol=1e-9)

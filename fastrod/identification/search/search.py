@@ -48,6 +48,7 @@ from fastrod.identification.search.solve import (
     bic,
     effective_size,
     held_out_losses,
+    least_squares,
     minimise,
     paired,
     rms,
@@ -315,7 +316,7 @@ class Search:
         b = J.T @ r
         # the base is at its minimum, priors and all
         b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)
-        return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
+        return float(b @ least_squares(gram, b))
 
     def judged(
         self, state: ModelState, with_it: ModelState, name: str, alternative: AlternativePattern | None = None
@@ -371,7 +372,7 @@ class Search:
             H = flat.T @ flat + np.diag(precision)
             b = flat.T @ state.fit.residual.ravel()
             b[: len(state.fit.theta)] = 0.0
-            step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
+            step = least_squares(H, b)
             residual = state.fit.residual - slopes @ step
             low, high = state.model.limits
             own = np.clip(
@@ -589,7 +590,7 @@ class Search:
                 moved[j] = u.mean + step
                 column = (at - state.linearised.residual(model, moved)).ravel() / step
                 cross = flat.T @ column
-                absorbed = np.linalg.lstsq(base, cross, rcond=1e-12)[0]
+                absorbed = least_squares(base, cross)
                 power = float(column @ column - cross @ absorbed)
                 # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
                 kind = next(

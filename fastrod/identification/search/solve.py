@@ -135,6 +135,14 @@ def _solve(A: Floats, b: Floats) -> Floats:
         return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
 
 
+def least_squares(A: Floats, b: Floats) -> Floats:
+    """The least x of a positive semidefinite A x = b, its unknowns measured by their own sizes."""
+    size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    scaled = b / (size[:, None] if b.ndim > 1 else size)
+    x = np.linalg.lstsq(A / np.outer(size, size), scaled, rcond=1e-12)[0]
+    return np.asarray(x / (size[:, None] if b.ndim > 1 else size))
+
+
 def covariance(fit: Fit) -> Floats:
     """(p, p) of the fitted numbers: priors and data. The data's variance and how its rows know of each other
     are those of the residual, so that what is left counts as the slow noise that it looks like. Whether the
@@ -150,7 +158,11 @@ def covariance_of(slopes: Floats, precision: Floats, correlation: Floats, varian
     this `variance` and this autocorrelation (k,); never less than that of independent rows."""
     flat = slopes.reshape(-1, slopes.shape[-1])
     gram = flat.T @ flat
-    plain = np.asarray(np.linalg.pinv(gram / variance + np.diag(precision)))
+    information = gram / variance + np.diag(precision)
+    size = np.sqrt(
+        np.maximum(np.diag(information), 1e-300)
+    )  # newtons and metres differ by more than rounding
+    plain = np.asarray(np.linalg.pinv(information / np.outer(size, size)) / np.outer(size, size))
     if len(correlation) < 2:
         return plain
     middle = flat.T @ correlated(slopes, correlation).reshape(flat.shape) / variance
