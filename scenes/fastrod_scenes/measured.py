@@ -249,7 +249,7 @@ def _armlab_robot() -> Robot:
             "tendon.*.gain": {"sd": 0.1},
             "tendon.*.angle": {"sd": 0.15},
         },
-        sensor={"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.005, "noise": ARMLAB_NOISE},
+        sensor={"registration_sd": (0.01, 0.05), "noise": ARMLAB_NOISE},
     )
 
 
