@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fastrod.errors import LogError, UnknownNameError
 from fastrod.logs.runlog import RunLog, read_log, write_log
 from fastrod.model.robotfile import load_robot
+from fastrod.model.routing import route
 
 GOOD = """t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z
 0.0,a,0,0,0,0,0,0,0.07
@@ -194,3 +195,15 @@ def test_shapes_are_checked_once():
     rows = {"t": np.zeros(2), "run": np.array(["", ""]), "dl": np.zeros((2, 4))}
     with pytest.raises(LogError, match=r"RunLog.tip_position has shape \(2, 2\); it must be \(2, 3\)"):
         RunLog(name="x", tip_position=np.zeros((2, 2)), **rows)
+
+
+def test_antagonists_that_can_only_pull_may_share_a_column(read) -> None:
+    """A motor that winds one wire up and pays the other out is one column."""
+    (segment,) = ROBOT.segments
+    wires = tuple(replace(t, unilateral=True, pretension=1.0) for t in segment.tendons)
+    robot = replace(ROBOT, segments=(replace(segment, tendons=wires),))
+    text = "t,dl_1,dl_2,tip_x,tip_y,tip_z\n0,-0.001,0.002,0,0,0.06\n1,0.0005,0,0,0,0.06\n"
+    wiring, given = route(robot), np.array([[-0.001, 0.002], [0.0005, 0.0]])
+    assert_array_equal(read(text, robot).dl, given[:, wiring.drive] * wiring.drive_sign)
+    with pytest.raises(LogError, match="has 2 dl_ columns"):
+        read(text)

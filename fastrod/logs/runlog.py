@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fastrod.errors import LogError, UnknownNameError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot, robot_names
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 Table: TypeAlias = dict[str, Sequence[str] | Floats]
@@ -169,7 +170,9 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
     t, tip = group(("t",)), group(_TIP)
     assert t is not None
     assert tip is not None
-    dl = group(_dl_columns(table, robot, where))
+    names, by_drive = _dl_columns(table, robot, where)
+    dl = group(names)
+    dl = dl if dl is None or by_drive is None else dl @ by_drive
     payload = group(("payload",))
     log = RunLog(
         name=path.stem,
@@ -390,10 +393,16 @@ def _nearest_column(name: str, table: Table) -> str:
     )
 
 
-def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:
-    """dl_1 ... dl_n of the robot, after a check that the log has these and no others."""
+def _dl_columns(table: Table, robot: Robot, where: str) -> tuple[list[str], Floats | None]:
+    """dl_1 ... dl_n of the robot, after a check that the log has these and no others. Of tendons that can
+    only pull, two on a drive, the log may have one column for each drive: then also (n_drives, n_tendons)
+    what a drive makes of its tendons."""
     names = [f"dl_{k}" for k in range(1, robot.n_tendons + 1)]
     given = [name for name in table if re.fullmatch(r"dl_\d+", name)]
+    wiring = route(robot)
+    if len(given) == wiring.n_drives < len(names) and all(t.unilateral for t in robot.tendons):
+        by_drive = np.eye(wiring.n_drives)[wiring.drive].T * wiring.drive_sign
+        return [f"dl_{k}" for k in range(1, wiring.n_drives + 1)], by_drive
     too_many = [name for name in given if name not in names]
     if too_many or (len(given) < len(names) and given):
         twins = [name for name in robot_names() if load_robot(name).n_tendons == len(given)]
@@ -404,7 +413,7 @@ def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:
             f"and needs {f'dl_1 to dl_{robot.n_tendons}' if names else 'none'}.{hint}"
         )
     _need(table, names, where, f"that robot {robot.name!r} needs for its {robot.n_tendons} tendons")
-    return names
+    return names, None
 
 
 def _extension(table: Table, robot: Robot, where: str, known: set[str]) -> Floats | None:

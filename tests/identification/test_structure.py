@@ -86,6 +86,27 @@ def test_a_report_says_what_was_tried_beside_them() -> None:
 
 
 @pytest.mark.study
+def test_what_pulls_to_one_side_is_found_with_its_antagonists() -> None:
+    """The file has the two tendons that the motors pull, the robot also the two that they pay out."""
+    (segment,) = built(pulls=True).segments
+    wires = tuple(replace(segment.tendons[0], angle=math.radians(a)) for a in (0.0, 180.0, 90.0, 270.0))
+    robot = replace(built(pulls=True), segments=(replace(segment, tendons=wires),))
+    t = 0.1 * np.arange(400)
+    pull = 4e-3 * np.stack([np.sin(0.7 * t) * np.cos(0.05 * t), np.sin(0.45 * t)], axis=1)
+    wiring = route(robot)
+    log = log_of(robot, pull[:, wiring.drive] * wiring.drive_sign, 0.1)
+    model, samples = base_model(robot), sample(log)
+    tip = predict(model, model.start, samples, PredictedRod(samples, robot)).position
+    tip = tip + NOISE * np.random.default_rng(1).normal(size=(400, 3))
+    plain = tuple(Tendon(offset=0.006, angle=a) for a in (0.0, 0.5 * math.pi))
+    body = replace(built(pulls=False).segments[0], tendons=plain)
+    result = identify(replace(log, dl=pull, tip_position=tip), replace(robot, segments=(body,)))
+    assert result.effects[0].name == NAME
+    assert result.identified.n_tendons == 4
+    assert result.test.after < 1.2 * math.sqrt(3.0) * NOISE
+
+
+@pytest.mark.study
 def test_push_pull_tendons_stay_what_they_are() -> None:
     result = identify(measured(pulls=False), built(pulls=False))
     assert (result.verdict, result.effects) == ("none", [])

@@ -17,6 +17,7 @@ from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import Model, known_model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
+from fastrod.identification.report.wording import words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -123,7 +124,7 @@ def verdict_on(
         structure=remaining,
         steps=outcome.steps,
         found=[
-            *(["tendons that can only pull"] if base.without else []),
+            *([words(ONE_SIDED)] if base.without else []),
             *(_spoken(name, explained.state.model, classes) for name in explained.names),
         ],
         held_out=(error.before, error.after),

@@ -108,7 +108,7 @@ def rounded(value: float, digits: int) -> str:
 
 def words(name: str) -> str:
     """`tendon_stretch` as 'tendon stretch'."""
-    return name.replace("_", " ")
+    return "tendons that can only pull" if name == ONE_SIDED else name.replace("_", " ")
 
 
 def a(noun: str) -> str:
