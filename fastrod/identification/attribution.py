@@ -14,7 +14,7 @@ from dataclasses import replace
 from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.questions import read
+from fastrod.identification.log.questions import read, time_question
 from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
 from fastrod.identification.log.unknowns import Model
@@ -147,7 +147,9 @@ def identify(
     base = replace(base, noise=base.noise.below(explained.train_error.after))
     grounds = verdict_on(base, outcome, explained, remaining)
     result = assemble(log, base, outcome, explained, remaining, grounds)
-    result = replace(result, notes=[*reading.questions, *result.notes])
+    # what was asked of a robot with other tendons is answered
+    questions = reading.questions if base.without is None else filter(None, [time_question(some)])
+    result = replace(result, notes=[*questions, *result.notes])
     if moved:
         at = between(robot, result.identified)
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."

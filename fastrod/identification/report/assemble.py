@@ -14,10 +14,10 @@ from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.split import SplitLog, thinned
-from fastrod.identification.log.unknowns import Model, known_model
+from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, known_model, nominal_of
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
-from fastrod.identification.report.wording import words
+from fastrod.identification.report.wording import plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -184,6 +184,7 @@ def assemble(
     say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
     strain = strained(base_estimates)
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
+    said += _sign_of(base.without) if base.without else []
     said += _sentences(limits(robot, samples)) if say_limits else []
     return Result(
         log=samples.log,
@@ -291,12 +292,37 @@ def _other_tendons(
     return Found(
         name=ONE_SIDED,
         title=(OneSidedTendons.__doc__ or "").strip().splitlines()[0],
-        parameters={name: e for name, e in estimates.items() if name.rpartition(".")[2] in asked},
+        parameters={
+            name: _in_its_unit(name, e, base.robot)
+            for name, e in estimates.items()
+            if name.rpartition(".")[2] in asked
+        },
         held_out_gain=(path[0].held_out ** 2 - path[1].held_out ** 2)
         / max(path[0].held_out ** 2 - floor**2, 1e-18),
         evidence={"z": best.z, "bic": best.bic_gain, "loss_share": best.fraction},
         cannot_be_told_from=[],
     )
+
+
+def _in_its_unit(name: str, e: Estimate, robot: Robot) -> Estimate:
+    """A number of other tendons in its own unit: what was nominal, no file says."""
+    kind = name.rpartition(".")[2]
+    if e.unit != "x nominal":
+        return e
+    unit, nominal = (SEGMENT_UNITS | TENDON_UNITS)[kind], nominal_of(robot, kind, 0)
+    sizes = {key: nominal * getattr(e, key) for key in ("value", "stderr", "prior_sd", "prior_mean")}
+    return replace(e, unit=unit, **sizes)
+
+
+def _sign_of(given: BaseFit) -> list[str]:
+    """The parameter that the file's own tendons pull furthest beyond its prior, in a sentence; none where
+    none is."""
+    estimates, _ = estimates_of(given.start.model, given.start.fit)
+    far = max(estimates, key=lambda name: abs(estimates[name].prior_distance), default="")
+    if not far or not estimates[far].beyond_prior:
+        return []
+    distance = abs(estimates[far].prior_distance)
+    return [f"The sign of it: with push-pull tendons {plain_name(far)} is {distance:.1f} sd from its prior."]
 
 
 def _fitted(base: BaseFit) -> set[str]:

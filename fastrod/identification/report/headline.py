@@ -69,6 +69,8 @@ def _numbers(result: Result) -> str:
     ratio = test.after / floor if floor > 0.0 else math.nan
     low, high = (millimetres(v) for v in test.interval)
     interval = f"rms, 95 % interval {low} to {high}" if low != NOTHING else "rms"
+    if result.as_given_rms is not None:
+        interval += f"; {millimetres(result.as_given_rms[1])} as shipped"
     if result.effects:
         old, new = millimetres(test.before), millimetres(test.after)
         error = f'<em class="was">{old}</em> <em class="to">→</em> <em class="is">{new}</em> mm'
