@@ -107,33 +107,7 @@ def identify(
         base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads, base)
     progressed(base.sentence, 0, most)
 
-    def other_tendons(base: BaseFit, left: float, less: float) -> tuple[SplitLog, BaseFit]:
-        """The log and the base fit of tendons that can only pull, where effects leave much and these
-        less."""
-        progressed("tendons that can only pull", 0, most)
-        found = one_sided(log, base, _FEW_ROWS, model_of, threads, less * left)
-        if found[1].without is not None:
-            progressed(f"tendons that can only pull: {found[1].sentence}", 0, most)
-        return found
-
-    try:
-        check_motion(base, reading.guess)
-    except LogError:  # of tendons that the file has otherwise, it may be
-        if max_effects and is_asked_for(base, base.left) and are_pulled(base):
-            log, base = other_tendons(base, base.left, _MUCH_LESS)
-        if base.without is None:
-            raise
-    # beside the best single effect, which may be all; then beside all that were found
-    first = _first(base, progressed, most) if max_effects and base.without is None else None
-    if first and is_asked_for(base, left := _left(base, first)) and are_pulled(base):
-        log, base = other_tendons(base, left, _MUCH_LESS)
-    outcome = _searched(base, max_effects, progressed, None if base.without else first)
-    if base.without is None and max_effects:
-        left = replace(base, start=outcome.state).left
-        if is_asked_for(base, left) and not base.rivals:
-            log, base = other_tendons(base, left, _LESS)
-        if base.without:
-            outcome = _searched(base, max_effects, progressed)
+    log, base, outcome = _found(log, base, reading.guess, max_effects, model_of, progressed, threads)
     progressed("prediction on all samples", most - 1, most)
     remaining = residual_structure(
         base.search.samples,
@@ -179,6 +153,46 @@ def _in_motion(
     found = fit_motion(log.samples.on(log.rows), model, robot, threads=threads, report=report)
     progressed("prediction on all samples", most - 1, most)
     return assemble_motion(log, robot, found, threads)
+
+
+def _found(
+    log: SplitLog,
+    base: BaseFit,
+    guess: str,
+    max_effects: int,
+    model_of: Callable[[Robot], Model],
+    progressed: Callable[[str, int, int], None],
+    threads: int | None,
+) -> tuple[SplitLog, BaseFit, SearchOutcome]:
+    """What the search finds, with log and base fit of the tendons that it goes on with. Raises `LogError`
+    where the model does not follow the log, as the sentence `guess` may say."""
+    most = max_effects + _SPARE + 2
+
+    def other_tendons(base: BaseFit, below: float) -> tuple[SplitLog, BaseFit]:
+        progressed("tendons that can only pull", 0, most)
+        found = one_sided(log, base, _FEW_ROWS, model_of, threads, below)
+        if found[1].without is not None:
+            progressed(f"tendons that can only pull: {found[1].sentence}", 0, most)
+        return found
+
+    try:
+        check_motion(base, guess)
+    except LogError:  # of tendons that the file has otherwise, it may be
+        if max_effects and is_asked_for(base, base.left) and are_pulled(base):
+            log, base = other_tendons(base, _MUCH_LESS * base.left)
+        if base.without is None:
+            raise
+    # beside the best single effect, which may be all; then beside all that were found
+    first = _first(base, progressed, most) if max_effects and base.without is None else None
+    if first and is_asked_for(base, left := _left(base, first)) and are_pulled(base):
+        log, base = other_tendons(base, _MUCH_LESS * left)
+    outcome = _searched(base, max_effects, progressed, None if base.without else first)
+    left = replace(base, start=outcome.state).left
+    if max_effects and base.without is None and not base.rivals and is_asked_for(base, left):
+        log, base = other_tendons(base, _LESS * left)
+        if base.without:
+            outcome = _searched(base, max_effects, progressed)
+    return log, base, outcome
 
 
 def _first(base: BaseFit, progressed: Callable[[str, int, int], None], most: int) -> SearchStep:

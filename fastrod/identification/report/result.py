@@ -53,7 +53,7 @@ class Tried:
     kept: bool
     why: str
     kind: str
-    """`effect`, or the kind of an alternative pattern."""
+    """`effect`, `tendons` for another base model, or the kind of an alternative pattern."""
 
 
 @dataclass(frozen=True, kw_only=True)
