@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import errno
 import logging
 import re
 import sys
@@ -106,6 +107,9 @@ def _main(path: str, kind: str, memory: str) -> int:
         print("memory", file=sys.stderr)
         return 3
     except Exception as error:  # every loader of trimesh raises its own
+        if isinstance(error, OSError) and error.errno == errno.ENOMEM:  # of a file that cannot be mapped
+            print("memory", file=sys.stderr)
+            return 3
         print(repr(error), file=sys.stderr)
         return 2
     return 0

@@ -188,7 +188,8 @@ def _found(
         log, base = other_tendons(base, _MUCH_LESS * left)
     outcome = _searched(base, max_effects, progressed, None if base.without else first)
     left = replace(base, start=outcome.state).left
-    if max_effects and base.without is None and not base.rivals and is_asked_for(base, left):
+    in_vain = max_effects and base.without is None and not base.rivals and not outcome.search.spent
+    if in_vain and is_asked_for(base, left):
         log, base = other_tendons(base, _LESS * left)
         if base.without:
             outcome = _searched(base, max_effects, progressed)
