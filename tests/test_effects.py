@@ -144,7 +144,7 @@ def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: 
     assert_array_equal(seen["measured points"].shape, (N_STEPS, N_ROBOTS, len(robot.log_points), 3))
 
 
-@pytest.mark.study(beyond=7)
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("name", NAMES)
 def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     robot = two_segments()

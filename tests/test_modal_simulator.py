@@ -212,7 +212,7 @@ def test_one_bad_row_leaves_its_neighbours_alone() -> None:
         assert_same(state, clean.step(**inputs(heavy(), k)), rest)
 
 
-@pytest.mark.study(beyond=31)
+@pytest.mark.study(beyond=14)
 @BOTH
 @pytest.mark.parametrize("name", NAMES)
 def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, options: dict[str, Any]) -> None:

@@ -76,6 +76,7 @@ def test_a_chain_of_links_goes_to_the_reference_at_second_order() -> None:
 
 
 @pytest.mark.parametrize("name", ["fastrod, in motion", "MuJoCo chain, hinges"])
+@pytest.mark.study(beyond=1)
 def test_all_in_one_call_is_one_after_the_other(name: str) -> None:
     rung, force = peer(name).rungs[1], bench_motion.forces(3)
     with rung.together() as together, rung.build() as alone:

@@ -274,6 +274,7 @@ def test_fcl_finds_the_same_distances() -> None:
     assert contact_batch.fcl_seconds(timed, obstacle, pose, 2)[1] == 2
 
 
+@pytest.mark.study
 def test_the_control_bench_runs_and_both_follow_the_path(capsys: pytest.CaptureFixture[str]) -> None:
     exact, differences = measured(capsys, "control")["control_step"]
     assert exact["kind"] == "analytic"

@@ -535,6 +535,7 @@ REFUSED = [
 @pytest.mark.parametrize(
     ("kind", "call", "sentence"), REFUSED, ids=[f"{kind.__name__}: {said[:40]}" for kind, _, said in REFUSED]
 )
+@pytest.mark.study(beyond=124)
 def test_it_says_what_was_given_and_what_would_be_right(
     kind: type[FastrodError], call: Callable[[], object], sentence: str
 ) -> None:

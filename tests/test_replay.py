@@ -197,6 +197,7 @@ def test_picture_leaves_out_what_was_not_measured(prototype: Robot) -> None:
     assert [text.get_text().strip() for text in panels[0].texts] == ["a", "b"]
 
 
+@pytest.mark.study
 def test_picture_of_a_dense_log_shows_envelopes_and_points_of_both(prototype: Robot) -> None:
     result = replay(long_log(2 * DENSE + 1), prototype, simulator=Arc)
     panels = axes_of(result)

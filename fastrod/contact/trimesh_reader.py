@@ -5,9 +5,9 @@ It needs nothing else of the package.
 
 from __future__ import annotations
 
+import errno
 import io
 import json
-import errno
 import logging
 import re
 import sys

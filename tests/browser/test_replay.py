@@ -38,6 +38,7 @@ def box_at_rest(seen: Window, thumb: Any) -> Any:
     return boxes[-1]
 
 
+@pytest.mark.study
 def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windows) -> None:
     app.open(DEMO_LOG)
     page = replayed(app)

@@ -182,6 +182,7 @@ def test_segment_agrees_with_brute_force(name):
     assert crossings > 20
 
 
+@pytest.mark.study
 def test_a_segment_parallel_to_a_face_is_not_missed():
     """Asked once, FCL misses one of these in a hundred or in a few thousand, by up to 6 mm."""
     rng = np.random.default_rng(8)
@@ -212,6 +213,7 @@ def test_a_segment_that_crosses_has_no_distance_and_one_of_no_length_is_a_point(
         assert scene.segment(0, p, p).distance == pytest.approx(abs(scene.point(0, p).distance), abs=EXACT)
 
 
+@pytest.mark.study
 def test_faces_far_below_a_millimetre_are_not_lost():
     """Without a scale of its own FCL drops the inside of such faces: 2e-5 m off for segments."""
     rng = np.random.default_rng(4)

@@ -106,6 +106,7 @@ def violation(W, b, friction, compliance, force):
 
 @pytest.mark.parametrize("m", [1, 2, 3, 5])
 @pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.study(beyond=4)
 def test_without_friction_it_is_the_right_choice_of_contacts(m, soft):
     rng = np.random.default_rng(1)
     n = 120

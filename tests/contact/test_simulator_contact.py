@@ -92,7 +92,7 @@ def test_rod_that_lies_on_a_soft_floor_needs_no_contact_at_every_place(stiffness
     assert press[0] > 0.5e-3 * stiffness  # the rod is clamped 1 mm inside, and its first contact hardly moves
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("dt", [1e-3, 5e-2])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_at_rest_nothing_chatters(dt, friction):

@@ -63,6 +63,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @tried(40)
 @given(table=good_tables())
+@pytest.mark.study
 def test_a_good_robot_is_read_written_and_simulated(path: Path, table: dict[str, Any]) -> None:
     path.write_text(written(table), encoding="utf-8")
     robot = loaded(path)

@@ -72,6 +72,7 @@ def test_words_are_a_command_or_a_sentence(command: str, rest: list[str]) -> Non
 
 @tried(60)
 @given(command=st.sampled_from(["replay", "identify"]), rest=st.lists(words, min_size=1, max_size=4))
+@pytest.mark.study
 def test_logs_that_are_not_there_are_refused(elsewhere: Path, command: str, rest: list[str]) -> None:
     before = Path.cwd()
     os.chdir(elsewhere)

@@ -56,6 +56,7 @@ def no_shape(*_: Any) -> None:
     raise InputError("no such shape.")
 
 
+@pytest.mark.study
 def test_what_is_made_is_reported_and_read_back(whole: Path) -> None:
     again = generate(small(), whole, workers=1)
     found = (again.count, again.rows, again.failed, again.shards, again.made, again.rate)

@@ -197,7 +197,7 @@ ASKED = {
 }
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_is_refused_with_a_guess(case: str) -> None:
     make, sentence = REFUSED[case]

@@ -251,7 +251,7 @@ BAD = {
 }
 
 
-@pytest.mark.study(beyond=8)
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize("case", BAD)
 def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> None:
     make, sentence = BAD[case]
@@ -275,6 +275,7 @@ def test_too_much_held_out_is_refused() -> None:
         identify(backlash_log(), robot(), held_out=["two", "three", "one@2:"], threads=1)
 
 
+@pytest.mark.study
 def test_a_search_that_would_not_end_stops_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "MOST_PASSES", 1.0)
     result = identify(backlash_log(), robot(), threads=1)

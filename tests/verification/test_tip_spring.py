@@ -79,6 +79,7 @@ def test_robots_of_a_batch_and_left_out_ones_keep_their_own_springs() -> None:
 
 
 @pytest.mark.parametrize("stiffness", [5.0, 30.0])
+@pytest.mark.study(beyond=1)
 def test_slopes_are_those_of_rod_and_spring_together(stiffness: float) -> None:
     robot = tied(two_segments(), stiffness)
     lengths = bend(robot, 0.4, 0.2) + bend(robot, -0.3, 0.4, 1) - robot.rest_tendon_length

@@ -341,7 +341,7 @@ def test_an_encoder_jump_is_seen_and_the_drive_moves_the_tendon_by_it(ready):
 
 
 @pytest.mark.parametrize("foreign", [1, 5, 40])
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 def test_answers_to_another_nodes_sync_do_not_pass_for_those_to_ours(ready, foreign):
     import can
 

@@ -264,6 +264,7 @@ EIGHT = r"answers 4 bytes for object 0x6502:00 .* says 8\. Is the EDS file that 
         ),
     ],
 )
+@pytest.mark.study(beyond=1)
 def test_a_file_of_another_drive_is_found_out(key, fact, says, write):
     with bench(write(shipped() | {key: fact})) as made, pytest.raises(DeviceError, match=says):
         made.bus.connect()

@@ -260,6 +260,7 @@ def flat(z: float = 0.0) -> Solid:
     return Solid(corners, np.array([[0, 1, 2], [0, 2, 3]]), (0.0, 0.0, 1.0))
 
 
+@pytest.mark.study
 def test_a_picture_shows_what_is_where() -> None:
     # seen from the side, the target in the middle; at distance d a metre is 360 / (2 d tan 18 deg) pixels
     view = {"eye": (2.0, 0.0, 0.3), "target": (0.0, 0.0, 0.3)}

@@ -23,7 +23,7 @@ VARIED: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", NAMES)
 def test_an_environment_does_not_know_its_neighbours(name, opened):
     hosted = task_class(name).hosted  # worlds of rigid bodies take their time

@@ -56,7 +56,7 @@ def test_names_are_ids() -> None:
         BatchEnv("Reech")
 
 
-@pytest.mark.study(beyond=5)
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_has_nothing_to_say(name, single):
     env = single(name)
@@ -83,7 +83,7 @@ def test_a_task_says_what_it_is(name: str) -> None:
     assert kind.accuracy > 0.0
 
 
-@pytest.mark.study(beyond=9)
+@pytest.mark.study(beyond=5)
 def test_spaces_are_those_of_the_fields(batch: BatchEnv) -> None:
     task, space = batch.task, batch.single_observation_space
     assert_array_equal(batch.single_action_space.low, -1.0)

@@ -210,6 +210,7 @@ def test_a_stop_on_the_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) 
     assert not kept.measured[kept.t > 1.6].any()
 
 
+@pytest.mark.study
 def test_a_law_beyond_the_limits_is_refused(bench: EmulatedBench, tmp_path: Path) -> None:
     made = circle_plan()
     with pytest.raises((RefusedError, DeviceError)) as caught:

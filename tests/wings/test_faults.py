@@ -202,7 +202,7 @@ def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(
         assert len(rig.recorder.stop().t) == rows
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> None:
     inject, _ = FAULTS[name]

@@ -149,7 +149,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_while_the_tendons_move_stops_all_at_once_and_is_named(name, rig, monkeypatch):
     inject, sentence = FAULTS[name]

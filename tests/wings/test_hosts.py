@@ -217,7 +217,7 @@ BAD_INPUT = {
 }
 
 
-@pytest.mark.study(beyond=5)
+@pytest.mark.study(beyond=3)
 @refusals({HostError: NOT_THERE, InputError: BAD_INPUT})
 def test_what_is_not_there_is_a_sentence(error, sentence, call):
     with pytest.raises(error, match=sentence):

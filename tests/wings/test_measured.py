@@ -222,6 +222,7 @@ def test_a_servo_of_the_opencr_robot_pulls_the_tip_to_its_tendons_side() -> None
 
 
 @needs_data
+@pytest.mark.study
 def test_cells_of_the_tdcr_cover_its_cube_of_shortenings() -> None:
     log, _ = armlab_tdcr(DATA / "armlab_tdcr.csv")
     assert len(log.runs) == 52

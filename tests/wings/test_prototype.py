@@ -114,7 +114,7 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
 # what it refuses
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("reported", "words"),
     [
@@ -227,6 +227,7 @@ def test_it_works_without_a_camera() -> None:
 
 
 @pytest.mark.parametrize("stepped", [True, False])
+@pytest.mark.study(beyond=1)
 def test_drives_that_are_not_there_are_one_sentence(stepped: bool) -> None:
     with Prototype(
         HARDWARE, "virtual:nobody", None, clock=SteppedClock() if stepped else WallClock()

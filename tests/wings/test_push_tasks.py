@@ -115,7 +115,7 @@ def test_goals_fill_their_rectangle_and_gather_in_its_middle_when_it_is_easy(nam
         assert_allclose(cell.desired, 0.5 * (np.array(cell.course.least) + cell.course.largest))
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("name", TASKS)
 def test_pictures_show_goal_and_cube_and_leave_the_world_as_it_is(name, begun):
     actions = some_actions(10)

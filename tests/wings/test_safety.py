@@ -314,6 +314,7 @@ lengths = st.lists(st.floats(-0.02, 0.02), min_size=4, max_size=4).map(np.array)
 
 @quickly
 @given(lengths, lengths, st.floats(0.001, 0.1), st.floats(0.0, 1.0))
+@pytest.mark.study
 def test_a_limited_step_goes_straight_and_no_tendon_beyond_its_rate(a, b, rate, dt):
     c = limited(a, b, rate, dt)
     assert np.abs(c - a).max() <= rate * dt * (1.0 + 1e-12) + 1e-17

@@ -20,7 +20,7 @@ def test_scene_keeps_to_its_physics(name):
     assert all(np.isfinite(value) for value in figures.values())
 
 
-@pytest.mark.study(beyond=4)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", names())
 def test_scene_says_what_it_is(name):
     scene = load(name)
@@ -33,7 +33,7 @@ def test_scene_says_what_it_is(name):
         assert scene.simulator().dt == scene.dt
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["draped", "pair", "wall"])
 def test_run_is_ok_from_the_first_input_to_the_last(name):
     scene = load(name)

@@ -112,6 +112,7 @@ def test_world_is_base_times_robot_and_the_base_rotates_it(make):
     assert_allclose(sim.calc_tip_pos(None, (0, 0, 1), DOWN)[0], [0, 0, 0.7], atol=1e-9)
 
 
+@pytest.mark.study
 def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make):
     sim, twin = make(), make()
     cube = sim.add_a_cube([0, 0.8, 0.3])
@@ -283,6 +284,7 @@ def test_a_tilted_cube_near_the_tip_makes_no_contact(make):
 # grasping
 
 
+@pytest.mark.study
 def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(make, caplog):
     sim = make(max_grasp_width=0.0)
     cube = sim.add_a_cube([0.005, 0, 0.03], ori=about_z(0.3), size=[0.06] * 3, mass=0.5)

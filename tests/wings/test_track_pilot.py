@@ -137,6 +137,7 @@ def test_a_path_of_ones_own_is_the_tasks_where_it_is_the_same() -> None:
     assert np.linalg.norm(far.nearest(0.0) - far.wanted(0.0)) < 0.012
 
 
+@pytest.mark.study
 def test_between_steps_the_command_stays() -> None:
     coarse, fine = PolicyDriver(policy(), "square"), PolicyDriver(policy(), "square")
     tips = PROTOTYPE.length * np.array([0.0, 0.0, 1.0]) + np.random.default_rng(2).normal(

@@ -51,6 +51,7 @@ def test_check_fails_without_gain(monkeypatch):
     assert soft_ur5.GAIN == 0.0
 
 
+@pytest.mark.study
 def test_check_fails_without_feedforward(monkeypatch):
     monkeypatch.setattr(TrackCircle, "duration", 3.0)
     monkeypatch.setattr(TrackingError, "feedforward", lambda self, t: np.zeros(3))
@@ -104,6 +105,7 @@ def test_soft_robot_alone_tracks_the_full_circle_and_the_held_arm_stays():
     assert np.ptp(run.tip[run.t > APPROACH], axis=0)[:2].max() > 0.2
 
 
+@pytest.mark.study
 def test_arm_alone_leaves_the_soft_robot_straight():
     run = follow(load("track_square_helix").path(), 3.0, movers="arm")
     assert run.mean_square(APPROACH) < LARGEST_ERROR

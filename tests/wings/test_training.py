@@ -193,6 +193,7 @@ def test_the_adapter_tells_what_stable_baselines_asks_for() -> None:
 
 
 @pytest.mark.parametrize("name", shipped())
+@pytest.mark.study(beyond=4)
 def test_shipped_policies_are_small_and_fit_their_environment(name: str) -> None:
     folder = find(name, "shipped")
     policy = Policy(folder)

@@ -350,6 +350,7 @@ def test_pictures_and_scripts_without_a_command(shown):
         pick.jacobian()
 
 
+@pytest.mark.study
 def test_rods_capsules_are_no_bodies(shown):
     world = shown("neck_push")
     numbers = {int(body.name.split()[1]) for body in world.bodies}
