@@ -103,8 +103,8 @@ def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     head = [made[key] for key in ("log", "robot", "n_samples", "held_out")]
     assert head == ["small", "prototype", 420, ["two"]]
     assert made["noise_floor_m"] == result.noise.floor
-    assert set(made["error"]["train"]) == {"before_rms_m", "after_rms_m"}
-    assert set(made["error"]["held_out"]) == {"before_rms_m", "after_rms_m", "interval_m", "all_rows_rms_m"}
+    assert set(made["error"]["train"]) == {"shipped_rms_m", "before_rms_m", "after_rms_m"}
+    assert set(made["error"]["held_out"]) == {*made["error"]["train"], "interval_m", "all_rows_rms_m"}
     low, high = made["error"]["held_out"]["interval_m"]
     assert low < made["error"]["held_out"]["after_rms_m"] < high
     assert made["verdict"] in ("none", "explained", "partly_explained", "ambiguous", "not_in_library")

@@ -26,7 +26,7 @@ from fastrod.identification.search.model_selection import Candidate, ModelState,
 from fastrod.identification.search.motion import HORIZONS, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
-from fastrod.identification.search.structure import are_pulled, is_asked_for, one_sided
+from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.solver.motion import solver_of
@@ -178,18 +178,18 @@ def _found(
     try:
         check_motion(base, guess)
     except LogError:  # of tendons that the file has otherwise, it may be
-        if max_effects and is_asked_for(base, base.left) and are_pulled(base):
+        if max_effects and are_worth_trying(base, base.left) and are_pulled(base):
             log, base = other_tendons(base, _MUCH_LESS * base.left)
         if base.without is None:
             raise
     # beside the best single effect, which may be all; then beside all that were found
     first = _first(base, progressed, most) if max_effects and base.without is None else None
-    if first and is_asked_for(base, left := _left(base, first)) and are_pulled(base):
+    if first and are_worth_trying(base, left := _left(base, first)) and are_pulled(base):
         log, base = other_tendons(base, _MUCH_LESS * left)
     outcome = _searched(base, max_effects, progressed, None if base.without else first)
     left = replace(base, start=outcome.state).left
     in_vain = max_effects and base.without is None and not base.rivals and not outcome.search.spent
-    if in_vain and is_asked_for(base, left):
+    if in_vain and are_worth_trying(base, left):
         log, base = other_tendons(base, _LESS * left)
         if base.without:
             outcome = _searched(base, max_effects, progressed)
@@ -219,7 +219,10 @@ def _searched(
 
 
 def _candidates(
-    base: BaseFit, max_effects: int, progressed: Callable[[str, int, int], None], first: SearchStep | None
+    base: BaseFit,
+    max_effects: int,
+    progressed: Callable[[str, int, int], None],
+    first: SearchStep | None = None,
 ) -> SearchOutcome:
     """Effects and alternative patterns that explain the residual of the base model, in the order in which
     they were found; the `first` stage may be known."""

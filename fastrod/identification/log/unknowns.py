@@ -260,14 +260,14 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             if isinstance(own, tuple):
                 new = tuple(v + now - was if kind == "angle" else v * now / was for v in own)
             if kind == "angle":  # a turn more or less is the same
-                new = tuple(map(_in_a_turn, new)) if isinstance(new, tuple) else _in_a_turn(new)
+                new = tuple(map(_wrapped, new)) if isinstance(new, tuple) else _wrapped(new)
             tendons[place] = replace(tendons[place], **{kind: new})
             # set again when all is known
             segments[k] = replace(segments[k], tendons=tuple(tendons), body_radius=0.0)
     return replace(robot, segments=tuple(segments), log_points=())
 
 
-def _in_a_turn(angle: float) -> float:
+def _wrapped(angle: float) -> float:
     return angle if abs(angle) <= 2.0 * math.pi else math.remainder(angle, 2.0 * math.pi)
 
 

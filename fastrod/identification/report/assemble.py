@@ -287,7 +287,7 @@ def _other_tendons(
     base: BaseFit, estimates: dict[str, Estimate], path: list[SearchStage], floor: float
 ) -> Found:
     """The tendons that the robot file did not have, as something that the model lacked."""
-    asked = _NUMBERS_OF_TENDONS if base.without is None else _NUMBERS_OF_TENDONS - _fitted(base.without)
+    kinds = _NUMBERS_OF_TENDONS if base.without is None else _NUMBERS_OF_TENDONS - _fitted(base.without)
     best = next(rival for rival in base.rivals if _is_taken(rival, base.robot))
     return Found(
         name=ONE_SIDED,
@@ -295,7 +295,7 @@ def _other_tendons(
         parameters={
             name: _in_its_unit(name, e, base.robot)
             for name, e in estimates.items()
-            if name.rpartition(".")[2] in asked
+            if name.rpartition(".")[2] in kinds
         },
         held_out_gain=(path[0].held_out ** 2 - path[1].held_out ** 2)
         / max(path[0].held_out ** 2 - floor**2, 1e-18),

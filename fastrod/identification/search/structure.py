@@ -57,7 +57,7 @@ class OneSidedTendons:
     """
 
 
-def is_asked_for(base: BaseFit, left: float) -> bool:
+def are_worth_trying(base: BaseFit, left: float) -> bool:
     """Whether push-pull tendons and effects leave so much, `left` [m], that other tendons are worth their
     time; the file says nothing of slack or shortening yet, and two tendons share a segment."""
     robot, tip = base.robot, base.search.target.tip
