@@ -198,10 +198,10 @@ def test_shapes_are_checked_once():
 
 
 def test_antagonists_that_can_only_pull_may_share_a_column(read) -> None:
-    """A motor that winds one wire up and pays the other out is one column."""
+    """A motor that winds one tendon up and pays the other out is one column."""
     (segment,) = ROBOT.segments
-    wires = tuple(replace(t, unilateral=True, pretension=1.0) for t in segment.tendons)
-    robot = replace(ROBOT, segments=(replace(segment, tendons=wires),))
+    tendons = tuple(replace(t, unilateral=True, pretension=1.0) for t in segment.tendons)
+    robot = replace(ROBOT, segments=(replace(segment, tendons=tendons),))
     text = "t,dl_1,dl_2,tip_x,tip_y,tip_z\n0,-0.001,0.002,0,0,0.06\n1,0.0005,0,0,0,0.06\n"
     wiring, given = route(robot), np.array([[-0.001, 0.002], [0.0005, 0.0]])
     assert_array_equal(read(text, robot).dl, given[:, wiring.drive] * wiring.drive_sign)

@@ -89,8 +89,8 @@ def test_a_report_says_what_was_tried_beside_them() -> None:
 def test_what_pulls_to_one_side_is_found_with_its_antagonists() -> None:
     """The file has the two tendons that the motors pull, the robot also the two that they pay out."""
     (segment,) = built(pulls=True).segments
-    wires = tuple(replace(segment.tendons[0], angle=math.radians(a)) for a in (0.0, 180.0, 90.0, 270.0))
-    robot = replace(built(pulls=True), segments=(replace(segment, tendons=wires),))
+    tendons = tuple(replace(segment.tendons[0], angle=math.radians(a)) for a in (0.0, 180.0, 90.0, 270.0))
+    robot = replace(built(pulls=True), segments=(replace(segment, tendons=tendons),))
     t = 0.1 * np.arange(400)
     pull = 4e-3 * np.stack([np.sin(0.7 * t) * np.cos(0.05 * t), np.sin(0.45 * t)], axis=1)
     wiring = route(robot)

@@ -163,9 +163,9 @@ def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict
     library = 0.7
     steps = [took(None), took(JUMP)]
     made = grounds(library=library, after=library - foreign, steps=steps, found=["backlash"])
-    told = () if verdict == "explained" else (JUMP.what,)  # no pattern is told at the noise
-    assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, told)
-    assert (JUMP.what in made.summary) == bool(told)
+    patterns = () if verdict == "explained" else (JUMP.what,)  # at the noise none is named
+    assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, patterns)
+    assert (JUMP.what in made.summary) == bool(patterns)
     assert ("backlash" in made.summary) != dropped
     assert made.kind == "drift"
 

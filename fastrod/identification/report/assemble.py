@@ -85,7 +85,8 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
         again = search_on(piece, base, base.search.target.sigma, state).again(start)
         start = _nearer(start, again, piece, base)
     bare = _everywhere(start, samples, base)
-    before = _as_given(base) if base.without else bare
+    given = base.without
+    before = _everywhere(given.start, given.search.samples, given) if given else bare
     after = _everywhere(state, samples, base) if names else bare
     measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
     residual = np.asarray(samples.log.tip_position) - after
@@ -164,7 +165,7 @@ def assemble(
     classes = _classes(steps, kept)
     effects = [_effect(name, final.model, estimates, classes, path, steps, noise.floor) for name in kept]
     if base.without:
-        effects = [_other_tendons(base, estimates, path, noise.floor), *effects]
+        effects = [_other_tendons(base, base.without, estimates, path, noise.floor), *effects]
         estimates = {name: e for name, e in estimates.items() if name not in effects[0].parameters}
     wiring = final.model.wiring
     lacks = (
@@ -265,29 +266,21 @@ def _own(state: ModelState, name: str) -> float:
     return float(((with_it - without) ** 2).sum())
 
 
-def _as_given(base: BaseFit) -> Floats:
-    """(n, 3) predicted tip of every sample [m] of the robot as it was given, with its own parameters
-    fitted."""
-    given = base.without or base
-    return _everywhere(given.start, given.search.samples, given)
-
-
 def _shipped(base: BaseFit, explained: Explained) -> tuple[float, float]:
     """Error of the robot file as it is, nothing fitted, on fitted and on held-out samples [m]."""
     given = base.without or base
-    samples = given.search.samples.on(np.arange(len(given.search.samples.log)))
-    rod = PredictedRod(samples, given.robot, threads=given.search.rod.threads)
-    pose = predict(known_model(given.robot), np.zeros(0), samples, rod)
-    tip = np.where(pose.ok[:, None], pose.position, np.nan)
+    samples = given.search.samples
+    tip = _tips(known_model(given.robot), np.zeros(0), samples, given)
     fitted, held_out = (error_of(samples, tip, tip, rows).before for rows in (explained.used, explained.test))
     return fitted, held_out
 
 
 def _other_tendons(
-    base: BaseFit, estimates: dict[str, Estimate], path: list[SearchStage], floor: float
+    base: BaseFit, given: BaseFit, estimates: dict[str, Estimate], path: list[SearchStage], floor: float
 ) -> Found:
-    """The tendons that the robot file did not have, as something that the model lacked."""
-    kinds = _NUMBERS_OF_TENDONS if base.without is None else _NUMBERS_OF_TENDONS - _fitted(base.without)
+    """The tendons of `base`, which the robot as it was `given` did not have, as what the model lacked; their
+    numbers are those that its file does not fit."""
+    kinds = _NUMBERS_OF_TENDONS - {target.rpartition(".")[2] for target in given.robot.fit}
     best = next(rival for rival in base.rivals if _is_taken(rival, base.robot))
     return Found(
         name=ONE_SIDED,
@@ -323,11 +316,6 @@ def _sign_of(given: BaseFit) -> list[str]:
         return []
     distance = abs(estimates[far].prior_distance)
     return [f"The sign of it: with push-pull tendons {plain_name(far)} is {distance:.1f} sd from its prior."]
-
-
-def _fitted(base: BaseFit) -> set[str]:
-    """Kinds of parameters that the file asks for."""
-    return {target.rpartition(".")[2] for target in base.robot.fit}
 
 
 def _is_taken(rival: Rival, robot: Robot) -> bool:
@@ -446,10 +434,16 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
 
 def _everywhere(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
     """(n, 3) predicted tip of every driven sample [m]; nan where the rod did not converge."""
+    return _tips(state.model, state.theta, samples, base)
+
+
+def _tips(model: Model, theta: Floats, samples: LogSamples, base: BaseFit) -> Floats:
+    """The same of a model at `theta` (p,)."""
     tip = np.full((len(samples.log), 3), np.nan)
     for start in range(0, len(tip), ALL_AT_ONCE):
         rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
-        pose = _predicted(state, samples.on(rows), base)
+        piece = samples.on(rows)
+        pose = predict(model, theta, piece, PredictedRod(piece, base.robot, threads=base.search.rod.threads))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip
 

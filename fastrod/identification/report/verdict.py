@@ -111,7 +111,7 @@ def choose_verdict(
     done = left <= _EXPLAINED if at_floor is None else at_floor and foreign <= _EXPLAINED
     if done:
         said = f"{_cut(found, held_out, base, library, floor)}."
-        # at the noise no pattern is told
+        # at the noise no pattern is named
         return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, (), False)
     what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
     if foreign > _FOREIGN or left > _PARTLY:
