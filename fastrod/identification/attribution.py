@@ -43,8 +43,8 @@ _MIN_GAIN = (
 )
 # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _SPARE = 2
-# of what the best single effect leaves, and of what all leave that were found: a robot of other tendons that
-# leaves less is the one to go on with
+# of what the best single effect leaves, and of what is left where none is certain or all were found: a robot
+# of other tendons that leaves less is the one to go on with
 _MUCH_LESS, _LESS = 0.8, 0.9
 MOST_SECONDS = 25.0
 """CPU s of a search, after which it begins no further stage; most logs take 5."""
@@ -185,7 +185,7 @@ def _found(
     # beside the best single effect, which may be all; then beside all that were found
     first = _first(base, progressed, most) if max_effects and base.without is None else None
     if first and are_worth_trying(base, left := _left(base, first)) and are_pulled(base):
-        log, base = other_tendons(base, _MUCH_LESS * left)
+        log, base = other_tendons(base, (_MUCH_LESS if left < base.left else _LESS) * left)
     outcome = _searched(base, max_effects, progressed, None if base.without else first)
     left = replace(base, start=outcome.state).left
     in_vain = max_effects and base.without is None and not base.rivals and not outcome.search.spent

@@ -131,15 +131,15 @@ class RunLog:
         extra = {key: _taken(value, index) for key, value in self.extra.items()}
         return replace(self, extra=extra, **cut)
 
-    def only(self, run: str) -> RunLog:
-        """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log
-        names none."""
-        run = str(run)  # numpy's words quote as np.str_(...)
-        if run not in self.runs:
-            if not (named := [" ".join(label.split()) for label in self.runs if label]):
-                raise UnknownNameError(f"no run {run!r}; log {self.name!r} names no runs.")
-            raise UnknownNameError(f"no run {run!r} in log {self.name!r}; {nearest(run, named)}")
-        return self.rows(self.run == run)
+    def only(self, *runs: str) -> RunLog:
+        """The samples of one run, or of several. Raises `UnknownNameError` with the nearest label, or saying
+        that the log names none."""
+        for run in map(str, runs):  # numpy's words quote as np.str_(...)
+            if run not in self.runs:
+                if not (named := [" ".join(label.split()) for label in self.runs if label]):
+                    raise UnknownNameError(f"no run {run!r}; log {self.name!r} names no runs.")
+                raise UnknownNameError(f"no run {run!r} in log {self.name!r}; {nearest(run, named)}")
+        return self.rows(np.isin(self.run, runs))
 
 
 def read_log(path: str | Path, robot: Robot) -> RunLog:

@@ -18,6 +18,7 @@ class AxialCompression(Static):
 
     Equation: l_k -> l_k (1 - e |theta_k|) + p c_k, with c_k what the tendons of segment k pull in common, and
     p the body's share of it
+    Symbols: e per_bend, p common_share, l_k length of segment k, theta_k its bend
     Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from tendons that pull only
     Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
     """

@@ -19,6 +19,7 @@ class Backlash(Operator):
 
     Equation: p = max(l - w, min(l + w, p)), at first l + w start; rounded corners are the mean over half
     widths w (1 - c), w, w (1 + c)
+    Symbols: w half_width, c rounding, l a tendon's commanded change of length, p what it ends at
     Source: play operator (Visintin 1994); backlash of tendon drives (Palli and Melchiorri)
     Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
     speed

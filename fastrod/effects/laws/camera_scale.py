@@ -14,6 +14,7 @@ class CameraScale(Static):
     """The camera's scale is off: a marker of another size, a focal length.
 
     Equation: y = (1 + k) r
+    Symbols: k scale, r tip, y what the camera sees
     Source: scale of a monocular camera
     Residual signature: away from the camera's origin, in proportion to the distance
     """

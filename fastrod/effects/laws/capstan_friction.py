@@ -23,6 +23,7 @@ class CapstanFriction(Operator):
 
     Equation: l -> l + c |T| (e^(-mu phi z) - 1), z the mean of sliders z_j = clip(z_j + l' / r_j, -1, 1), phi
     the angle that the tendon wraps, c its compliance, r_j over r e^(-+s)
+    Symbols: mu as named, r presliding, s spread, T tension, l a tendon's commanded change of length
     Source: capstan equation, Kaneko 1991, Palli and Melchiorri; sliders in parallel, Iwan 1966
     Residual signature: loops as those of friction, but wider under load and hardly open where a tendon is
     loose

@@ -14,6 +14,7 @@ class CompressionSoftening(Static):
     """The body bends more easily while all its tendons pull.
 
     Equation: theta_k -> theta_k (1 - g c_k), with c_k < 0 what the tendons of segment k pull in common
+    Symbols: g gain, theta_k the bend of segment k
     Source: column under axial load, EI (1 - P / P_cr) (Timoshenko and Gere 1961), against tendons that
     stretch
     Residual signature: in proportion to bend times common pull; nothing where one pair moves alone

@@ -17,6 +17,7 @@ class Coupling(Static):
     """Tendons of one segment bend its neighbour too.
 
     Equation: theta_k -> theta_k + c theta_(k+1) + d theta_(k-1)
+    Symbols: c from_distal, d from_proximal, theta_k the bend of segment k
     Source: Camarillo, Carlson and Salisbury 2009; Roy, Wang and Simaan 2017
     Residual signature: in proportion to the neighbour's command
     """

@@ -18,6 +18,7 @@ class Creep(Operator):
     """Viscoelastic body or tendons: part of the bend comes late.
 
     Equation: l -> l - c (l - x), tau x' = l - x
+    Symbols: c share, tau time_constant, l a tendon's commanded change of length, x its slow part
     Source: standard linear solid (Zener); creep of polymer tendons and silicone bodies
     Residual signature: after a step it decays with time whatever the direction; loops that depend on speed
     """

@@ -14,6 +14,7 @@ class DrumGain(Static):
     """Each drive pays out more or less tendon than it reports: a drum of another radius, layers of tendon.
 
     Equation: dl_i -> (1 + g_i) dl_i, antagonists alike (the part that bends)
+    Symbols: g_i gain of drive i, dl_i its commanded change of length
     Source: definition; multi-layer winding of a drum
     Residual signature: in proportion to the bend, per drive, blind to speed and load
     """

@@ -14,6 +14,7 @@ class EncoderOffset(Static):
     """The drives' zeros do not belong to the straight rod.
 
     Equation: dl_i -> dl_i + o_i, antagonists opposite (the part that bends)
+    Symbols: o_i offset of drive i, dl_i its commanded change of length
     Source: definition; joint offset of robot calibration (Hollerbach and Wampler 1996)
     Residual signature: the whole arc is turned by a constant bend: tip and tip orientation together
     """

@@ -20,6 +20,7 @@ class FrameMisalignment(Static):
     """The camera's frame is not the base's.
 
     Equation: y = exp[w] r + t
+    Symbols: w rotation, t shift, r tip, y what the camera sees
     Source: rigid registration (Horn 1987)
     Residual signature: affine in the measured position; the same for every load and orientation
     """

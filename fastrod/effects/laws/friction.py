@@ -19,6 +19,8 @@ class Friction(Operator):
 
     Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), at first -start, phi the
     angle that the tendon wraps, r_j over r e^(-+s)
+    Symbols: a half_width, r presliding, k growth, s spread, z_j how far slider j is drawn, l a tendon's
+    commanded change of length
     Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato et al. 2015, Palli and
     Melchiorri
     Residual signature: sign of the last direction of motion, saturating with travel; loops that grow with the

@@ -15,6 +15,7 @@ class Gravity(Static):
     """Self-weight of the body.
 
     Equation: f(s) += rho g, world frame
+    Symbols: rho line_density, f force per length
     Source: Rucker and Webster 2011, distributed load of the rod equations
     Residual signature: fixed to gravity: turns against the base; an S, which moves the tip and hardly turns
     it

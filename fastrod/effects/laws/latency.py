@@ -18,6 +18,7 @@ class Latency(Operator):
     """Delay between command and measured tip, of the drives, the bus and the camera together.
 
     Equation: l(t) = l_cmd(t - d), a cubic between samples; d is cut to the last 128 samples
+    Symbols: d delay, l_cmd the command, l what the rod gets
     Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a
     process model)
     Residual signature: along the velocity of the predicted tip and in proportion to it, zero at rest

@@ -14,6 +14,7 @@ class Lens(Static):
     """Radial distortion of the camera's lens, looking along the base's axis.
 
     Equation: (x, y) -> (x, y) (1 + k (x^2 + y^2) / L^2)
+    Symbols: k radial, L the robot's length
     Source: Brown 1971, first radial term
     Residual signature: radial in the image, static and cubic
     """

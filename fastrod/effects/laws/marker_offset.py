@@ -16,6 +16,7 @@ class MarkerOffset(Static):
     """The marker is not at the tip's centre.
 
     Equation: y = r + R m
+    Symbols: m x, y and z in the tip's frame, r tip, R its rotation, y what the camera sees
     Source: hand-eye registration of a marker
     Residual signature: turns with the tip
     """

@@ -15,6 +15,7 @@ class Payload(Static):
     """A mass at the tip that nobody declared, or more of it than declared.
 
     Equation: F += m g at the tip, world frame
+    Symbols: m mass, F force at the tip
     Source: Rucker and Webster 2011, tip load
     Residual signature: as self-weight, with the lever of the tip; torsion when bent sideways
     """

@@ -15,6 +15,7 @@ class PlasticSet(Operator):
     """The body yields at large bends and keeps a set.
 
     Equation: theta -> theta + c p, p dragged along once |theta - p| > y; it begins at the straight rod
+    Symbols: c share, y yield_at, theta the bend that a segment's lengths ask for, p what has set
     Source: elasto-plastic stop with an isotropic yield surface (Visintin 1994)
     Residual signature: nothing until a new extreme, then it stays: the rod does not return to zero
     """

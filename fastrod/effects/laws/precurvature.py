@@ -16,6 +16,7 @@ class Precurvature(Static):
 
     Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff tendons do not straighten, and a
     uniform part, which they do
+    Symbols: b bow, u_0 uniform, u* curvature at rest, s from 0 to the segment's length l
     Source: paper eq. 1c, m = K (u - u*)
     Residual signature: constant in the body frame: the tip moves and does not turn
     """

@@ -16,6 +16,7 @@ class RoutingAngle(Static):
     """Tendons sit at other angles around the backbone than drawn.
 
     Equation: d_i -> rotation by beta_i about the tangent
+    Symbols: beta_i angle of drive i, d_i its tendons' places in the cross-section
     Source: definition; d_i = offset (cos b_i, sin b_i)
     Residual signature: across the bend, in proportion to it
     """

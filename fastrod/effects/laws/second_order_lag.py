@@ -18,6 +18,7 @@ class SecondOrderLag(Operator):
     inertia is `Simulator(dynamics=True)`.
 
     Equation: T^2 y'' + 2 z T y' + y = theta
+    Symbols: T period, z damping, theta the commanded lengths, y what they follow
     Source: second-order lag of linear control, T^2 s^2 + 2 z T s + 1 in the denominator
     Residual signature: ringing after stops, lag that grows with speed
     """

@@ -17,6 +17,7 @@ class SettlingDrift(Static):
     """A drift that settles: base, mount or camera warm up and come to rest elsewhere.
 
     Equation: y = r + d (1 - exp(-t / tau)), t since the start of the run
+    Symbols: d x, y and z, tau time_constant, r tip, y what the camera sees
     Source: first-order thermal warm-up of a mount
     Residual signature: fast at first, then less and less, in time alone
     """

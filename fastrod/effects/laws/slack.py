@@ -16,6 +16,7 @@ class Slack(Static):
     """Dead zone at neutral: an antagonistic pair that hangs loose before either tendon pulls.
 
     Equation: dl -> sgn(dl) max(|dl| - w, 0) (the part that bends)
+    Symbols: w half_width, dl the tendons' commanded changes of length
     Source: dead zone of slack tendons, T = max(0, k lambda)
     Residual signature: static, odd, only around neutral of each pair; no loop
     """

@@ -18,6 +18,7 @@ class Slip(Static):
 
     Equation: l -> l + s from t = at on, t since the start of the run, for the first tendon of a drive, - s
     for its antagonist (the part that bends)
+    Symbols: s step, at its time, l a tendon's commanded change of length
     Source: definition; lost steps and slipping clamps of tendon drives
     Residual signature: none, then at one time and from there on that of a zero that is off
     """

@@ -17,6 +17,7 @@ class Stiffening(Static):
     """The body gets stiffer (or softer) as it bends, and its tendons stretch for it.
 
     Equation: theta -> theta (1 - c min(|theta|^2, 2)) in each segment
+    Symbols: c cubic, theta the bend that a segment's lengths ask for
     Source: Yeoh 1993, cubic term of a hyperelastic bending moment against tendons in series
     Residual signature: odd and cubic in the bend, static
     """

@@ -14,6 +14,7 @@ class StiffnessAnisotropy(Static):
     """The body is stiffer about one axis than about the other.
 
     Equation: EI_x -> EI_x (1 + e), EI_y -> EI_y (1 - e)
+    Symbols: e ratio, EI_x and EI_y bending stiffness about the two axes
     Source: Kirchhoff rod, u_z' = (EI_x - EI_y) u_x u_y / GJ
     Residual signature: twist in proportion to u_x u_y: on diagonals, even in amplitude
     """

@@ -15,6 +15,7 @@ class StiffnessTaper(Static):
     """The body is stiffer at one end.
 
     Equation: K(s) = K (1 + a (1 - 2 s / l)) in each segment
+    Symbols: a slope, K stiffness, s from 0 to the segment's length l
     Source: Kirchhoff rod with K(s); Rucker and Webster 2011, IEEE T-RO 27(6)
     Residual signature: along the normal, in proportion to the bend; the tip's angle stays
     """

@@ -17,6 +17,7 @@ class Temperature(Static):
     """Warm-up: the gain of bending settles over minutes while motors and body get warm.
 
     Equation: dl -> (1 + g (1 - exp(-t / tau))) dl, t since the start of the run (the part that bends)
+    Symbols: g gain, tau time_constant, dl the tendons' commanded changes of length
     Source: first-order thermal warm-up; softening of TPU with temperature
     Residual signature: slow, in proportion to the bend, the same whatever was commanded before
     """

@@ -31,6 +31,7 @@ class TendonInteraction(Static):
     + w_m p_m + c_i p_n^2 + d_i p_m^2, for the pull p_i = -dl of a drive, n the next drive of the segment
     counter-clockwise and m the one before (w_i: of the pair i and n). Of two drives n and m are the same:
     w_1, c_1, c_2 alone act. Only the part that bends
+    Symbols: a slope, b curvature, w pair, c next, d previous
     Source: definition: the logarithm of the gain, expanded to second order in the pulls
     Residual signature: static, a polynomial of the pulls with their products; none of it for a small pull
     alone

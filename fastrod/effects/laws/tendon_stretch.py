@@ -15,6 +15,8 @@ class TendonStretch(Static):
     """Tendons stretch under tension.
 
     Equation: l_i = L_i + (c_i + c) T_i
+    Symbols: c compliance, c_i that of tendon i in the robot file, T_i its tension, L_i its path, l_i its
+    commanded length
     Source: Oliver-Butler, Till and Rucker 2019
     Residual signature: loss of gain, in proportion to the moment; the tip turns under load
     """

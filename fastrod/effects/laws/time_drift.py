@@ -14,6 +14,7 @@ class TimeDrift(Static):
     """Base, camera or clock creep away: the measured tip moves steadily with time.
 
     Equation: y = r + v t, t since the start of the run
+    Symbols: v x, y and z, r tip, y what the camera sees
     Source: definition; slow drift of a sensor
     Residual signature: slow, in time alone
     """

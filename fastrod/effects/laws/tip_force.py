@@ -16,6 +16,7 @@ class TipForce(Static):
     """A constant force on the tip, fixed to the base: a cable that drags, a spring.
 
     Equation: F += R_base f
+    Symbols: f x, y and z in the base frame, F force at the tip
     Source: Rucker and Webster 2011, tip load
     Residual signature: static; does not turn when the base is turned against gravity
     """

@@ -17,6 +17,7 @@ class TipSpring(Static):
     """A spring between the tip and a point that is fixed to the base: an elastic cable, a tether.
 
     Equation: F += R_base k (p - r), r the tip and p the point in the base frame
+    Symbols: k stiffness, p x, y and z, F force at the tip
     Source: Hooke's law, a spring without a length of its own
     Residual signature: static; grows with the distance from a point, and pulls the tip there from all sides
     """

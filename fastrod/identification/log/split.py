@@ -67,10 +67,10 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     if len(logs) == 1:
         return logs[0]
     names = [log.name for log in logs]
-    if len(set(names)) < len(names):
+    own = [(log.name, run) for log in logs for run in log.runs]
+    if twice := [name for i, (name, run) in enumerate(own) if (name, run) in own[:i]]:
         raise LogError(
-            f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that "
-            "their runs can be distinguished."
+            f"two logs are named {twice[0]!r}; rename one, so that their runs can be distinguished."
         )
     if len({log.dl.shape[1] for log in logs}) > 1:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
@@ -99,7 +99,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
             )
     labels = [np.array([f"{log.name}:{label}" if label else log.name for label in log.run]) for log in logs]
     return RunLog(
-        name=" + ".join(names),
+        name=" + ".join(dict.fromkeys(names)),
         t=np.concatenate([log.t for log in logs]),
         run=np.concatenate(labels),
         dl=np.concatenate([log.dl for log in logs]),

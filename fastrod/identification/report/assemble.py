@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, has_memory
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, known_model, nominal_of
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
+from fastrod.identification.report.signature import signatures
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
-from fastrod.identification.report.wording import plain_name, words
+from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
@@ -25,6 +26,7 @@ from fastrod.identification.search.search import Search, SearchOutcome
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import SLACK, OneSidedTendons
+from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
@@ -32,6 +34,8 @@ ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
 _MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
 _MOST_ADVICE = 5  # runs
+_BEYOND = 7.0  # times a typical size: no tendon's friction or play is so large
+_DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
 _NEAR = 1.1  # of the noise: a held-out error within it is explained
@@ -163,7 +167,9 @@ def assemble(
         test_error = error_of(samples, before, after, explained.test, measured & log.tested, length)
     estimates, correlation = estimates_of(final.model, final.fit)
     classes = _classes(steps, kept)
-    effects = [_effect(name, final.model, estimates, classes, path, steps, noise.floor) for name in kept]
+    effects = [
+        _effect(name, final, estimates, classes, path, steps, samples.log, noise.floor) for name in kept
+    ]
     if base.without:
         effects = [_other_tendons(base, base.without, estimates, path, noise.floor), *effects]
         estimates = {name: e for name, e in estimates.items() if name not in effects[0].parameters}
@@ -186,6 +192,7 @@ def assemble(
     strain = strained(base_estimates)
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
     said += _sign_of(base.without) if base.without else []
+    said += _stand_ins(kept, final)
     said += _sentences(limits(robot, samples)) if say_limits else []
     return Result(
         log=samples.log,
@@ -218,6 +225,20 @@ def assemble(
         solves=base.search.rod.runs,
         as_given_rms=shipped,
     )
+
+
+def _stand_ins(names: Sequence[str], state: ModelState) -> list[str]:
+    """Laws of memory that are larger than any tendon or body, in sentences."""
+    said = []
+    for u, number in zip(state.model.unknowns, state.theta, strict=True):
+        if u.place[0] != "effect" or u.place[1] not in names or not has_memory(get_effect(u.place[1])):
+            continue
+        value = u.inside(float(number))
+        if u.unit in ("m", "") and abs(value) > _BEYOND * u.scale:
+            size = f"{plain_name(u.name)} comes out at {amount(value, u.unit)}"
+            usual = f"{abs(value) / u.scale:.0f} times what is usual"
+            said.append(f"{size}, {usual}: {words(u.place[1])} stands in for something else.")
+    return said
 
 
 def _left_out(explained: Explained, error: Error) -> list[str]:
@@ -333,23 +354,27 @@ def _spoken(name: str, model: Model, classes: dict[str, list[str]]) -> str:
 
 def _effect(
     name: str,
-    model: Model,
+    state: ModelState,
     estimates: dict[str, Estimate],
     classes: dict[str, list[str]],
     path: list[SearchStage],
     steps: Sequence[SearchStep],
+    log: RunLog,
     floor: float,
 ) -> Found:
     parameters = {
         key.partition(".")[2]: value for key, value in estimates.items() if key.partition(".")[0] == name
     }
-    taken = next((s.taken for s in steps if s.taken is not None and s.taken.name == name), None)
+    step = next((s for s in steps if s.taken is not None and s.taken.name == name), None)
+    taken, others = (None, ()) if step is None else (step.taken, step.candidates)
+    states = {c.name: c.state for c in others if c.state is not None and c.alternative is None}
+    rivals = classes.get(name, [])
     evidence = {} if taken is None else {"z": taken.z, "bic": taken.bic_gain, "loss_share": taken.fraction}
     at = next(i for i, stage in enumerate(path) if stage.name == name)
     excess = max(path[0].held_out ** 2 - floor**2, 1e-18)
     gain = (path[at - 1].held_out ** 2 - path[at].held_out ** 2) / excess
     title = (type(get_effect(name)).__doc__ or name).strip().splitlines()[0]
-    drive = model.drive_of(name)
+    drive = state.model.drive_of(name)
     if drive is not None:
         title = f"{title} Only drive {drive + 1} has it."
     return Found(
@@ -358,8 +383,9 @@ def _effect(
         parameters=parameters,
         held_out_gain=gain,
         evidence=evidence,
-        cannot_be_told_from=classes.get(name, []),
+        cannot_be_told_from=rivals,
         drive=None if drive is None else drive + 1,
+        signatures=signatures(name, state, [(r, states[r]) for r in rivals[:_DRAWN] if r in states], log),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from fastrod.identification.report.result import Result
 from fastrod.identification.report.signals import Signals, SignalView, bin_means
+from fastrod.identification.report.signature import Signature
 from fastrod.identification.report.wording import millimetres, words
 from fastrod.types import Flags, Floats, Ints
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, MEASURED, NOISE = "#e07b1a", "#2166c4", "#374151", "#15803d"
+_RIVALS = ("#8e44ad", "#0f766e", "#9a3412")
 _INK, _FAINT, _HELD = "#4b5563", "#d5dae1", "#eef1f6"
 _WIDE = 11.0  # in
 _VECTOR = 500  # points of a scatter above which it is a picture inside the SVG
@@ -157,8 +159,9 @@ def close_up(result: Result, signals: Signals) -> tuple[str, str]:
     return out(), f"{f'run {run}, ' if run else ''}{time[0]:.0f} to {time[-1]:.0f} s"
 
 
-def against_signal(view: SignalView, result: Result, name: str) -> str:
-    """A component of the residual, before and after, against what explains it."""
+def against_signal(view: SignalView, result: Result, name: str, alone: Sequence[Signature] = ()) -> str:
+    """A component of the residual, before and after, against what explains it; left of it what an effect and
+    its rivals do `alone`."""
     held = result.tested[view.rows]
     panels = [("before", BEFORE, view.before), ("after", AFTER, view.after)]
     panels = panels if result.effects else [("base model", BEFORE, view.before)]
@@ -166,7 +169,11 @@ def against_signal(view: SignalView, result: Result, name: str) -> str:
     sigma = 1e3 * float(np.sqrt(np.mean(result.noise.sigma**2)))
     limit = max(limit, 3.5 * sigma)
     with _figure(name, 3.7) as (figure, out):
-        grid = np.atleast_1d(figure.subplots(1, len(panels), sharex=True, sharey=True))
+        right = figure
+        if alone:
+            left, right = _halves(figure, (1.0, 2.0))
+            _alone(left.subplots(), alone)
+        grid = np.atleast_1d(right.subplots(1, len(panels), sharex=True, sharey=True))
         for axes, (title, colour, values) in zip(grid, panels, strict=True):
             axes.axhspan(-2.0 * sigma, 2.0 * sigma, color=NOISE, alpha=0.10, lw=0)
             for level in (-2.0 * sigma, 2.0 * sigma):
@@ -356,6 +363,17 @@ def _small(png: re.Match[str]) -> str:
 def _halves(figure: Figure, ratios: tuple[float, float]) -> tuple[Any, Any]:
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=ratios), dtype=object)
     return left, right
+
+
+def _alone(axes: Axes, alone: Sequence[Signature]) -> None:
+    """What effects do by themselves to the tip, the one that was named first."""
+    inks = zip(alone, (AFTER, *_RIVALS), ("-", "--", "-.", ":"), strict=False)
+    for one, colour, dashes in inks:
+        axes.plot(one.signal, 1e3 * one.shift, color=colour, ls=dashes, label=words(one.name))
+    axes.axhline(0.0, color="#9ca3af", lw=0.7)
+    axes.set(title="the law alone", xlabel=alone[0].signal_label, ylabel=f"{alone[0].shift_label} [mm]")
+    if len(alone) > 1:
+        axes.legend(loc="best")
 
 
 def _cloud(axes: Axes, view: SignalView, values: Floats, held: Flags, colour: str) -> None:

@@ -123,7 +123,13 @@ def _effect(result: Result, found: Found, view: SignalView) -> str:
         f"{'Strong' if view.connected else 'Dark'}: held out. Before: base model; after: with all that was "
         "found."
     )
-    picture = figures.against_signal(view, result, f"effect-{found.name}")
+    if found.signatures:
+        others = ", and those that it cannot be distinguished from," if len(found.signatures) > 1 else ""
+        caption = (
+            f"Left: what the law{others} does to the tip by itself, with the numbers below, while one bend "
+            f"swings to and fro, less and less. Right: {caption[0].lower()}{caption[1:]}"
+        )
+    picture = figures.against_signal(view, result, f"effect-{found.name}", found.signatures)
     return section(words(found.name).capitalize(), escape(found.title), figure(picture, caption), laws, proof)
 
 

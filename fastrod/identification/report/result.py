@@ -11,6 +11,7 @@ import numpy as np
 
 from fastrod.identification.log.noise import Noise
 from fastrod.identification.log.registration import CameraRegistration
+from fastrod.identification.report.signature import Signature
 from fastrod.identification.search.model_selection import Bound
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
@@ -38,6 +39,8 @@ class Found:
     cannot_be_told_from: Sequence[str]
     drive: int | None = None
     """The one drive that has it, from 1 on; None where it is not one drive's."""
+    signatures: Sequence[Signature] = ()
+    """What it does by itself, then what the effects do that it cannot be told from; empty without tendons."""
 
 
 @dataclass(frozen=True, kw_only=True)

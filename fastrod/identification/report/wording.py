@@ -126,12 +126,12 @@ def plain_name(name: str) -> str:
 
 
 def law(name: str) -> dict[str, str]:
-    """Equation, Source and Residual signature of an effect, or of other tendons, from its docstring."""
+    """Equation, Symbols, Source and Residual signature of an effect, or of other tendons, from its
+    docstring."""
     what = OneSidedTendons if name == ONE_SIDED else type(get_effect(name))
     text = inspect.cleandoc(what.__doc__ or "")
-    found = re.findall(
-        r"^(Equation|Source|Residual signature): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE
-    )
+    keys = "Equation|Symbols|Source|Residual signature"
+    found = re.findall(rf"^({keys}): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE)
     return {key: " ".join(value.split()) for key, value in found}
 
 

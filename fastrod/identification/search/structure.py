@@ -48,8 +48,8 @@ _PRETENSION_SD = 0.3  # of the tension that the largest bend takes
 class OneSidedTendons:
     """Tendons can only pull: they go slack, have a pretension and stretch, and the body shortens.
 
-    Equation: T = max(0, T0 + (l - l_commanded) / c), and the segment shortens by T l / EA; c, T0 and EA as
-    the parameters say
+    Equation: T = max(0, T0 + (l - l_commanded) / c), and the segment shortens by T l / EA
+    Symbols: T tension, T0 pretension, c compliance, EA axial_stiffness, l the tendon's path in the body
     Source: Rucker and Webster 2011, Statics and dynamics of continuum robots with general tendon routing,
     with the tensions of one-sided tendons
     Residual signature: where tendons pay out the robot bends less than their lengths ask for, and by another
