@@ -170,6 +170,16 @@ def test_several_runs_begin_with_no_memory() -> None:
     assert np.abs(predicted(robot, merged).position - found.position).max() > 1e-4
 
 
+def test_a_run_that_continues_another_continues_its_memories() -> None:
+    """The same motion labelled as two runs: bit for bit, but for effects that count the time of a run."""
+    robot = having(two_segments(), *(m for m in MEMORIES if has_memory(get_effect(m["name"]))))
+    whole = log(robot)
+    halves = replace(whole, run=np.repeat(["a", "b"], N // 2))
+    assert len(sample(halves).runs) == 2
+    assert [(part.start, part.stop) for part in sample(halves).histories] == [(0, N)]
+    assert_array_equal(predicted(robot, halves).position, predicted(robot, whole).position)
+
+
 def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
     robot = having(two_segments(), *MEMORIES)
     what = log(robot)

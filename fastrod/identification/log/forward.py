@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +48,7 @@ _FINE = 2e-3  # of steps of slopes and of the tolerance, where tendons can go sl
 # hundreds of them)
 _LOST = 500
 _BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
+_SOON = 10.0  # s
 _FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 MODES = Modes(4, 2)  # of rods that need modes, as far off
@@ -80,7 +82,13 @@ class LogSamples:
     time: Floats
     """(n,) since the start of its run [s]."""
     dt: Floats
-    """(n,) since the sample before; 0 at the start of a run [s]."""
+    """(n,) since the sample before; 0 at the start of a run, unless it continues the run before [s]."""
+
+    @property
+    def histories(self) -> tuple[slice, ...]:
+        """Samples over which a memory goes on: of each run, with the runs that continue it."""
+        starts = [span.start for span in self.runs if not self.dt[span.start]]
+        return tuple(slice(*ends) for ends in pairwise([*starts, len(self.dt)]))
 
     def on(self, rows: Ints) -> LogSamples:
         """The same samples, compared at other rows."""
@@ -96,9 +104,16 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
     time, dt = np.empty(len(ordered)), np.zeros(len(ordered))
+    t, dl = ordered.t, ordered.dl
+    largest = max((np.abs(np.diff(dl[span], axis=0)).max(initial=0.0) for span in runs), default=0.0)
     for span in runs:
-        time[span] = ordered.t[span] - ordered.t[span.start]
-        dt[span.start + 1 : span.stop] = np.diff(ordered.t[span])
+        first = span.start
+        time[span] = t[span] - t[first]
+        dt[first + 1 : span.stop] = np.diff(t[span])
+        # a run goes on where the one before ends: soon after it, and the commands do not jump
+        jump = np.abs(dl[first] - dl[first - 1]).max(initial=0.0)
+        if first and 0.0 < t[first] - t[first - 1] <= _SOON and jump <= largest:
+            dt[first] = t[first] - t[first - 1]
     measured = np.flatnonzero(ordered.measured) if rows is None else rows
     return LogSamples(ordered, order, measured, runs, time, dt)
 
@@ -242,7 +257,7 @@ class PreparedLog:
                 every.solved_tension = self.tension
             for each in links[:swept]:
                 if has_memory(each.effect):
-                    sweep(each, every, self.samples.runs, self.samples.dt)
+                    sweep(each, every, self.samples.histories, self.samples.dt)
                 else:
                     act([each.on(len(every))], every)
                     act([each.on(len(opened))], opened)  # for what it changes beside the tendons' lengths

@@ -188,7 +188,7 @@ def features(samples: LogSamples, wiring: Routing) -> tuple[Floats, Floats, Floa
         for width in (1.5, 5.0):
             direction = width * rng.normal(size=(now.shape[1], _RANDOM // 2))
             static.append(np.cos(now @ direction + rng.uniform(0.0, 2.0 * np.pi, _RANDOM // 2)))
-    memory = [_memory(b[span], samples.dt[span]) for span in samples.runs]
+    memory = [_memory(b[span], samples.dt[span]) for span in samples.histories]
     t = np.cumsum(samples.dt)
     t = t / max(float(t[-1]), 1e-9)
     drift = np.stack([f(np.pi * k * t) for k in range(1, 7) for f in (np.sin, np.cos)] + [t, t**2], axis=1)
