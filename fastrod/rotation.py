@@ -60,3 +60,13 @@ def quaternion_from_vector(vector: Floats) -> Floats:
     """(..., 4) quaternion w x y z of a rotation vector (..., 3) [rad]."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector], axis=-1)
+
+
+def segment_bends(rotation: Floats, n_segments: int) -> Floats:
+    """(n, n_segments, 2) integral of the curvature about d1 and d2 over each segment [rad], from
+    world_from_material (n, n_points, 3, 3) at points that share the segments' length evenly."""
+    turned = quaternion_from_matrix(np.swapaxes(rotation[:, :-1], -1, -2) @ rotation[:, 1:])
+    sine = np.linalg.norm(turned[..., 1:], axis=-1)
+    angle = 2.0 * np.arctan2(sine, turned[..., 0])
+    vectors = turned[..., 1:3] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[..., None]
+    return np.asarray(vectors.reshape(len(rotation), n_segments, -1, 2).sum(2))

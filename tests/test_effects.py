@@ -18,7 +18,16 @@ import fastrod
 import fastrod.effects.base as registry
 from fastrod import Robot, Simulator, load_robot, save_robot
 from fastrod.commands.cli import main
-from fastrod.effects.base import Operator, Seam, columns, effect_names, get_effect, has_memory, trait
+from fastrod.effects.base import (
+    BodyOperator,
+    Operator,
+    Seam,
+    columns,
+    effect_names,
+    get_effect,
+    has_memory,
+    trait,
+)
 from fastrod.effects.pipeline import EffectPipeline
 from fastrod.errors import EffectError, UnknownNameError
 from fastrod.kernels.operators import BUFFER
@@ -471,7 +480,7 @@ def test_an_effect_says_what_it_is(name: str) -> None:
     assert any(not p.shape for p in what.parameters)
     wiring = route(two_segments())
     assert len(columns(what, wiring)) == len(registry.read_values(name, {}, wiring, "test"))
-    assert has_memory(what) == isinstance(what, Operator)
+    assert has_memory(what) == isinstance(what, (Operator, BodyOperator))
 
 
 def test_effects_act_from_the_motor_to_the_camera() -> None:

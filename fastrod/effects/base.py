@@ -92,6 +92,8 @@ class Parameter:
     shared: bool = False
     """Of one per drive. True: drives are alike unless one is worn, so a fit has one number for all, or one
     drive alone."""
+    apart: bool = False
+    """Of one per segment. True: segments differ, so a fit has a number for each."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -194,6 +196,9 @@ class Law:
     reads_tension: ClassVar[bool] = False
     """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
     solve it together with the rod."""
+    reads_bend: ClassVar[bool] = False
+    """It reads `ports.solved_bend`, what the rod makes of its tendons: with it the bend, not the command, has
+    a memory. When it is of which state, as with `reads_tension`."""
     nests: ClassVar[Mapping[str, Mapping[str, str | float]]] = {}
     """Laws that this one contains, by name, and where: what each of these parameters is there, a number or
     another parameter. Which of the two it is is decided by where the estimate lies, for the richer one never
@@ -252,6 +257,32 @@ class Operator(Law, ABC):
         """(n, n_tendons) by how much lengths change [m], from what `sweep` has changed: the same, unless it
         takes what the ports have besides lengths."""
         return swept
+
+
+class BodyOperator(Law, ABC):
+    """Base of effects with a memory of how the body was bent: operators on the solved bends over time.
+
+    A simulator calls `sweep` with one step, identification with a whole log.
+    """
+
+    seam = Seam.MATERIAL
+    reads_bend = True
+
+    @abstractmethod
+    def sweep(self, values: Floats, memory: Floats, bend: Floats) -> Floats:
+        """(n_robots, n_steps, n_segments, 2) the bend that stays back [rad], from that which the rod has,
+        `bend` of the same shape. `memory` (n_robots, m) is changed in place; nan in it means that the body
+        was at rest at the first step."""
+        ...
+
+    @abstractmethod
+    def stiffening(self, values: Floats, n_segments: int) -> Floats:
+        """(n_robots,) times the body's own stiffness by which it is stiffer where nothing slides."""
+        ...
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        """One step of `sweep`."""
+        ports.rest_bend += self.sweep(values, memory, ports.solved_bend[:, None])[:, 0]
 
 
 _REGISTRY: dict[str, Effect] = {}

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.effects.base import Effect, Operator, Seam, get_effect, trait
+from fastrod.effects.base import BodyOperator, Effect, Operator, Seam, get_effect, trait
 from fastrod.effects.ports import EffectPorts
+from fastrod.model.routing import Routing
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
 
@@ -46,19 +47,19 @@ class Link(NamedTuple):
         )
 
 
-def at_rest(what: Effect, n: int, n_tendons: int) -> Floats:
+def at_rest(what: Effect, n: int, routing: Routing) -> Floats:
     """(n, m) memory of an effect at the start; m is 0 without one. Of an effect that feels the tip a
     simulator keeps the force that it had, where the tip was, and how it gave (n, 3 + 3 + 9)."""
     if feels_tip(what):
         return np.zeros((n, 15))
-    memory = what.memory(n, n_tendons)
+    memory = what.memory(n, 2 * routing.n_segments if reads_bend(what) else routing.n_tendons)
     return np.empty((n, 0)) if memory.size == 0 else memory
 
 
-def link(name: str, values: Floats, n_tendons: int) -> Link:
+def link(name: str, values: Floats, routing: Routing) -> Link:
     """The effect of this name at rest, with `values` (n, n_columns)."""
     what = get_effect(name)
-    return Link(name, what, values, at_rest(what, len(values), n_tendons))
+    return Link(name, what, values, at_rest(what, len(values), routing))
 
 
 def feels_tip(what: Effect) -> bool:
@@ -69,6 +70,11 @@ def feels_tip(what: Effect) -> bool:
 def reads_tension(what: Effect) -> bool:
     """Whether an effect depends on the tension that tendons have."""
     return bool(trait(what, "reads_tension"))
+
+
+def reads_bend(what: Effect) -> bool:
+    """Whether an effect depends on how the rod is bent."""
+    return bool(trait(what, "reads_bend"))
 
 
 def tip_feedback(links: Sequence[Link], opened: EffectPorts, tip: Floats) -> tuple[Floats, Floats]:
@@ -127,6 +133,35 @@ def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> 
             np.broadcast_to(one.values, (len(dl), one.values.shape[1])), change, opened
         )
     opened.shift_tendons(change)
+
+
+def approach(links: Iterable[Link], n_segments: int) -> Floats:
+    """(n,) or (1,) part of the way to the bend that a rod has answered, after which what effects hold back
+    and the bend come to rest together: a body that is r times stiffer where nothing slides answers with r
+    times what it is held back by too little, at most."""
+    stiffer = np.zeros(1)
+    for each in links:
+        if isinstance(each.effect, BodyOperator):
+            stiffer = stiffer + each.effect.stiffening(each.values, n_segments)
+    return 1.0 / (1.0 + stiffer)
+
+
+def relaxed(part: Floats, off: Floats, before: Floats, least: Floats) -> Floats:
+    """(n,) part of the way to go next, from that of the last time and how far bends (n, k) were off then and
+    are now [rad] (Aitken's rule for vectors, Irons and Tuck 1969)."""
+    gone = off - before
+    found = -part * (before * gone).sum(1) / np.maximum((gone**2).sum(1), 1e-30)
+    return np.asarray(np.clip(found, least, 1.0))
+
+
+def stay_back(one: Link, bend: Floats, runs: Sequence[slice]) -> Floats:
+    """(n, n_segments, 2) the bend that an effect with a memory of the body holds back [rad], at samples of
+    `runs`, each from rest, whose solved bend (n, n_segments, 2) is known."""
+    assert isinstance(one.effect, BodyOperator)
+    out = np.empty_like(bend)
+    for span in runs:
+        out[span] = one.effect.sweep(one.values, one.memory.copy(), bend[None, span])[0]
+    return out
 
 
 def sense(links: Iterable[Link], opened: EffectPorts, seen: SensedPoses, dt: float = 0.0) -> SensedPoses:

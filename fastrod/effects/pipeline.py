@@ -15,7 +15,7 @@ from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
-from fastrod.rotation import matrix_from_quaternion
+from fastrod.rotation import matrix_from_quaternion, segment_bends
 from fastrod.types import Flags, Floats, Params, Ports
 
 
@@ -80,7 +80,7 @@ class EffectPipeline:
                 for named, r in zip(tables, robots, strict=True)
             ]
             values = np.broadcast_to(np.array(rows), (n_robots, len(rows[0]))).copy()
-            self.links.append(executor.link(name, values, self.routing.n_tendons))
+            self.links.append(executor.link(name, values, self.routing))
         self.time = np.full(n_robots, np.nan)
         """(n_robots,) since the first step [s]; nan before it."""
         self.pulls_tip = False
@@ -88,7 +88,12 @@ class EffectPipeline:
         self._tip_links = [link for link in self.links if executor.feels_tip(link.effect)]
         self._reads_tension = any(executor.reads_tension(link.effect) for link in self.links)
         self._tension = np.zeros((n_robots, self.routing.n_tendons))
+        self._reads_bend = any(executor.reads_bend(link.effect) for link in self.links)
+        self._bend = np.zeros((n_robots, self.routing.n_segments, 2))
+        self._part = np.ones(n_robots)
+        self._off: Floats | None = None
         self._lengths: Floats | None = None
+        self._turned = np.zeros(n_robots)
         self._before: list[Floats] = []
         self._cold = np.zeros(n_robots, bool)
         self.tip_step = np.zeros(n_robots)
@@ -112,13 +117,14 @@ class EffectPipeline:
 
     @property
     def follows(self) -> bool:
-        """Whether an effect depends on what the rod does: on where its tip is, or its tendons' tension."""
-        return self.feels_tip or self._reads_tension
+        """Whether an effect depends on what the rod does: on where its tip is, how it is bent, or its
+        tendons' tension."""
+        return self.feels_tip or self._reads_tension or self._reads_bend
 
     def reset(self, rows: Any) -> None:
         """Let these robots begin at rest again."""
         for link in self.links:
-            link.memory[rows] = executor.at_rest(link.effect, self.n_robots, self.routing.n_tendons)[rows]
+            link.memory[rows] = executor.at_rest(link.effect, self.n_robots, self.routing)[rows]
         self.time[rows] = np.nan
 
     def act(
@@ -162,12 +168,17 @@ class EffectPipeline:
                 self._tension = np.where(np.isfinite(state.tension), state.tension, self._tension)
             self._tension = np.where(cold[:, None], 0.0, self._tension)
             opened.solved_tension = self._tension
+        if self._reads_bend:
+            opened.solved_bend = self._follow_bend(state, self._cold & (not again), again)
         executor.act(self.links, opened, state, dt)
         self.tip_step = np.zeros(len(opened))
         if self._reads_tension:
             if again and self._lengths is not None:
                 self.tip_step = np.abs(opened.tendon_length - self._lengths).max(1, initial=0.0)
             self._lengths = opened.tendon_length.copy()
+        if self._reads_bend:
+            # also where nothing that is held back has changed: it remembers the bend
+            self.tip_step = self.tip_step + self._turned * float(self.routing.length.sum())
         if self._tip_links:
             self._feel(opened, state, compliance, self._cold if not again else np.zeros_like(skip))
         for link, old in zip(self.links, before, strict=bool(before)):
@@ -175,6 +186,32 @@ class EffectPipeline:
             only = slice(3) if executor.feels_tip(link.effect) else slice(None)
             link.memory[skip, only] = old[skip, only]
         return close_ports(opened, ports, params)
+
+    def _follow_bend(self, state: Any, cold: Flags, again: bool) -> Floats:
+        """(n_robots, n_segments, 2) of the last state; of robots that are `cold` 0. Where a step is repeated
+        `again`, part of the way to it (`executor.approach`)."""
+        if state is not None and not len(state.rotation):
+            raise EffectError(
+                "an effect goes by how the body is bent, which outputs='tip' leaves out; give "
+                "Simulator(robot, outputs='full')."
+            )
+        if state is not None:
+            found = segment_bends(state.rotation, self.routing.n_segments)
+            found = np.where(np.isfinite(found), found, self._bend)
+            self._off = self._off if again else None
+            self._bend = self._nearer(found) if again else found
+        self._bend = np.where(cold[:, None, None], 0.0, self._bend)
+        return self._bend.copy()
+
+    def _nearer(self, found: Floats) -> Floats:
+        """The bends to go by next, on the way to those that were `found`; how far that is, in `_turned`."""
+        off = (found - self._bend).reshape(len(found), -1)
+        least = executor.approach(self.links, self.routing.n_segments)
+        self._part = least if self._off is None else executor.relaxed(self._part, off, self._off, least)
+        self._off = off
+        # what holds nothing back need not remember
+        self._turned = np.where(least < 1.0, np.abs(off).sum(1), 0.0)
+        return np.asarray(self._bend + (self._part[:, None] * off).reshape(found.shape))
 
     def _feel(self, opened: EffectPorts, state: Any, compliance: Floats | None, cold: Flags) -> None:
         """Add the force of effects that feel the tip, a Newton step nearer to balance; the first of them
@@ -267,6 +304,7 @@ class EffectPipeline:
             time=np.nan_to_num(self.time),
             n_steps=n_steps,
         )
+        opened.solved_bend = self._bend.copy()
         # these are not commanded: nothing to act on
         opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
         for given in (

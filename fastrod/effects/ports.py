@@ -23,6 +23,7 @@ CHANGEABLE = (
     "pretension",
     "stiffness",
     "precurvature",
+    "rest_bend",
     "tip_force",
     "tip_moment",
     "line_force",
@@ -69,6 +70,8 @@ class EffectPorts:
     """(n, n_segments, n_k, 3) diag K, n_k 1 or 2 n_steps + 1 [N m^2]; see `resolve`."""
     precurvature: Floats
     """(n, n_segments, n_k, 3) u*, material frame [1/m]."""
+    rest_bend: Floats
+    """(n, n_segments, 2) bend without moments beside `precurvature`, uniform in a segment [rad]."""
     tip_force: Floats
     """(n, 3) [N]."""
     tip_moment: Floats
@@ -84,6 +87,9 @@ class EffectPorts:
     solved_tension: Floats = field(default_factory=lambda: np.zeros((1, 1)))
     """Read: (n, n_tendons) or (1, 1) of the last solution, for effects that read it; 0 before the first
     [N]."""
+    solved_bend: Floats = field(default_factory=lambda: np.zeros((1, 1, 2)))
+    """Read: (n, n_segments, 2) about d1 and d2 of the last solution, for effects that read it; 0 before the
+    first [rad]."""
     point_forces: list[tuple[Floats, Floats]] = field(default_factory=list)
     """Arclength (n,) [m] and force (n, 3) [N] of each that effects have added through `add_point_force`."""
     tip_position: Floats = field(default_factory=_none)
@@ -98,7 +104,7 @@ class EffectPorts:
 
     def rows(self, which: slice) -> EffectPorts:
         """A copy of some rows."""
-        alike = ("routing", "rest_length", "n_steps", "stateless", "state", "solved_tension")
+        alike = ("routing", "rest_length", "n_steps", "stateless", "state", "solved_tension", "solved_bend")
         return EffectPorts(
             **{
                 f.name: getattr(self, f.name) if f.name in alike else getattr(self, f.name)[which].copy()
@@ -242,6 +248,7 @@ def open_ports(
         base_pose=_rows(ports.base_pose, n),
         stiffness=_rows(ports.stiffness, n),
         precurvature=_rows(ports.precurvature, n),
+        rest_bend=np.zeros((n, routing.n_segments, 2)),
         tip_force=_rows(ports.tip_force, n),
         tip_moment=_rows(ports.tip_moment, n),
         line_force=_rows(ports.line_force, n),
@@ -255,6 +262,10 @@ def close_ports(
 ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
     """What the kernel reads, from ports that effects have changed, and the point forces (arclength (n,) [m],
     force (n, 3) world [N]) that they have added."""
+    precurvature = np.ascontiguousarray(opened.precurvature)
+    if opened.rest_bend.any():
+        precurvature = precurvature.copy()
+        precurvature[..., :2] += (opened.rest_bend / opened.routing.length[:, None])[:, :, None]
     return (
         ports._replace(
             tendon_length=opened.tendon_length,
@@ -262,7 +273,7 @@ def close_ports(
             base_pose=opened.base_pose,
             extension=opened.extension,
             stiffness=np.ascontiguousarray(opened.stiffness),
-            precurvature=np.ascontiguousarray(opened.precurvature),
+            precurvature=precurvature,
             tip_force=opened.tip_force,
             tip_moment=opened.tip_moment,
             line_force=np.ascontiguousarray(opened.line_force),

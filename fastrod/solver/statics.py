@@ -50,7 +50,7 @@ _ALONG = (
     "base_wrench",
 )
 DIVERGED = "the observer diverged, and no shape was found on these inputs"
-_BALANCE = 20  # rounds of `settle` in which a rod and a force that goes by its tip come to rest
+_BALANCE = 40  # rounds of `settle` in which a rod and a force that goes by its tip come to rest
 _UNSTABLE = "the shape that balances its loads is an unstable one"
 
 

@@ -310,7 +310,7 @@ def _opencr_robot() -> Robot:
             "tendon.*.compliance": {"sd": OPENCR_COMPLIANCE, "shared": True},
             "tendon.*.pretension": {"sd": 2.0 * OPENCR_PRETENSION},
         },
-        sensor={"registration_sd": (0.01, 0.1), "latency_sd": 0.15},
+        sensor={"registration_sd": (0.01, 0.1)},
     )
 
 

@@ -210,6 +210,28 @@ def test_yielding_has_no_favourite_direction() -> None:
 # Laws in time
 
 
+@pytest.mark.parametrize("spread", [0.0, 1.2])
+def test_a_body_with_friction_stays_where_it_comes_from(spread: float) -> None:
+    """A rod without tendons under a moment: l M / EI less what the elements hold back, each up to a / n."""
+    bare, a, w = rod("passive"), 0.05, 0.04
+    name, more = ("body_hysteresis", {"spread": spread}) if spread else ("body_friction", {})
+    sim = Simulator(replace(bare, effects=({"name": name, "bend": a, "width": w} | more,)))
+    (segment,) = bare.segments
+    free = segment.length / segment.bending_stiffness[1]
+    widths = w * np.exp(np.linspace(-spread, spread, SLIDERS if spread else 1))
+    dragged, before, found, expected = np.zeros(len(widths)), 0.0, [], []
+    for moment in 1.2 / free * np.sin(np.linspace(0.0, 9.0, 40)):
+        state = sim.settle(tip_moment=(0.0, moment, 0.0), tolerance=1e-11 * bare.length)
+        assert state.ok.all()
+        turned = Rotation.from_matrix(state.tip_rotation[0]).as_rotvec()[1]
+        dragged = np.clip(dragged + (turned - before) / widths, -1.0, 1.0)
+        before = turned
+        found.append(turned)
+        expected.append(free * moment - a * dragged.mean())
+    assert_allclose(found, expected, rtol=0, atol=1e-7)
+    assert np.ptp(np.array(found) - free * (1.2 / free * np.sin(np.linspace(0.0, 9.0, 40)))) > 1.9 * a
+
+
 def test_relaxation_after_a_step() -> None:
     # c (1 - exp(-t / tau)) of it comes late: out = 1 - c exp(-t / tau); the step takes no time
     dt = np.concatenate([[0.1, 0.0], np.random.default_rng(5).uniform(0.001, 2.0, 40)])

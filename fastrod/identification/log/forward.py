@@ -19,12 +19,16 @@ from fastrod.effects.executor import (
     Link,
     SensedPoses,
     act,
+    approach,
     approached,
     feels_tip,
     from_base,
     link,
+    reads_bend,
     reads_tension,
+    relaxed,
     sense,
+    stay_back,
     sweep,
     tip_feedback,
 )
@@ -36,7 +40,7 @@ from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
-from fastrod.rotation import matrix_from_quaternion
+from fastrod.rotation import matrix_from_quaternion, segment_bends
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.solver.modal import Modes
 from fastrod.solver.motion import solver_of
@@ -118,6 +122,15 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     return LogSamples(ordered, order, measured, runs, time, dt)
 
 
+class RodAnswer(NamedTuple):
+    """What a rod does besides its pose, for the effects that go by it."""
+
+    tension: Floats
+    """(n, n_tendons) 0 where no tendon stretches [N]."""
+    bend: Floats
+    """(n, n_segments, 2) [rad]"""
+
+
 class PredictedRod:
     """The batch that solves the rows of `samples`; it stays warm from one parameter vector to the next."""
 
@@ -129,14 +142,12 @@ class PredictedRod:
         self.threads = threads
         self.samples, self.points = samples, points and samples.log.points is not None
         bare = replace(robot, effects=())
-        # tendons that do not stretch show no effect of their tension
-        self._tense = any(tendon.compliance > 0.0 for tendon in robot.tendons)
         n = len(samples.rows)
         self._sim = Simulator(
             bare,
             n_robots=n,
             points_per_segment=N_STEPS,
-            outputs="full" if self.points or self._tense else "tip",
+            outputs="full",
             modes=MODES if solver_of([bare], None, False) == "modal" else None,
             threads=threads,
         )
@@ -146,8 +157,7 @@ class PredictedRod:
         """Of the usual steps of slopes: a tendon that goes slack or taut within one bends it."""
         self._tolerance = self.fine * TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
-        self.tension: Floats = np.zeros((n, robot.n_tendons))
-        """(n, n_tendons) of the last solution, 0 where no tendon stretches [N]."""
+        self.answer = RodAnswer(np.zeros((n, robot.n_tendons)), np.zeros((n, robot.n_segments, 2)))
         self.runs = 0
         """Batches solved so far."""
         self.cost = 0.0
@@ -169,7 +179,8 @@ class PredictedRod:
             replace(robot, effects=()),
         )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
-        self.tension = np.nan_to_num(state.tension) if len(state.tension) else 0.0 * ports.tendon_length
+        bend = segment_bends(state.rotation, len(robot.segments))
+        self.answer = RodAnswer(np.nan_to_num(state.tension), np.nan_to_num(bend))
         points = np.zeros((len(state.ok), 0, 3))
         if self.points:
             points = (
@@ -213,6 +224,8 @@ class PreparedLog:
     """(n_rows, 3, 3) or (1, 3, 3)."""
     tension: Floats | None = None
     """(n, n_tendons) that tendons have at every sample, as far as it is known [N]."""
+    beyond: Floats | None = None
+    """(n, n_segments, 2) by which the rod is bent beyond what its tendons ask for at every sample [rad]."""
 
     def open(self) -> EffectPorts:
         """Ports of the rows, ready for effects."""
@@ -220,16 +233,23 @@ class PreparedLog:
             self.ports, len(self.samples.rows), self.samples.time[self.samples.rows], self.base_rotation
         )
 
-    def under(self, solved: Floats, ok: Flags) -> PreparedLog:
-        """The same with the tension (n_rows, n_tendons) [N] of the rows that are `ok`, linear in time between
-        these."""
-        rows, tension = self.samples.rows[ok], np.zeros_like(self.dl)
+    def under(self, answer: RodAnswer, asked: Floats, ok: Flags, part: Floats | None = None) -> PreparedLog:
+        """The same with the tension and the bends of a solution, of the rows that are `ok`, the bends `part`
+        (n_rows,) of the way; effects had gone by `asked` (n_rows, n_segments, 2)."""
+        off = (answer.bend - asked).reshape(len(ok), -1)
+        off = self._between(off if part is None else part[:, None] * off, ok).reshape(-1, *asked.shape[1:])
+        beyond = off if self.beyond is None else self.beyond + off
+        return replace(self, tension=self._between(answer.tension, ok), beyond=beyond)
+
+    def _between(self, at_rows: Floats, ok: Flags) -> Floats:
+        """(n, k) at every sample, linear in time between the rows (n_rows, k) that are `ok`."""
+        rows, found = self.samples.rows[ok], np.zeros((len(self.dl), at_rows.shape[1]))
         for span in self.samples.runs:
             inside = (rows >= span.start) & (rows < span.stop)
-            for k in range(tension.shape[1] if inside.any() else 0):
-                known = self.samples.time[rows[inside]], solved[ok][inside, k]
-                tension[span, k] = np.interp(self.samples.time[span], *known)
-        return replace(self, tension=tension)
+            for k in range(found.shape[1] if inside.any() else 0):
+                known = self.samples.time[rows[inside]], at_rows[ok][inside, k]
+                found[span, k] = np.interp(self.samples.time[span], *known)
+        return found
 
     def _open(self, ports: Ports, n: int, time: Floats, base_rotation: Floats) -> EffectPorts:
         return open_ports(
@@ -248,8 +268,8 @@ class PreparedLog:
     def drive(self, links: Sequence[Link]) -> EffectPorts:
         """Ports of the rows after the effects of `links`, less sensing and those that feel the tip. Up to the
         last one with a memory they run over every sample, for the tendons' lengths."""
-        opened, rest = self.open(), self.robot.rest_tendon_length
-        swept = 1 + max((i for i, each in enumerate(links) if has_memory(each.effect)), default=-1)
+        opened, rest, dl = self.open(), self.robot.rest_tendon_length, self.dl
+        swept = 1 + max((i for i, each in enumerate(links) if _of_tendons(each)), default=-1)
         if swept:
             alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
             every = self._open(alone, len(self.dl), self.samples.time, self.base_rotation[:1])
@@ -261,38 +281,52 @@ class PreparedLog:
                 else:
                     act([each.on(len(every))], every)
                     act([each.on(len(opened))], opened)  # for what it changes beside the tendons' lengths
-            opened.tendon_length = every.dl[self.samples.rows] + rest
-        act([each.on(len(opened)) for each in links[swept:]], opened)
+            dl = every.dl
+            opened.tendon_length = dl[self.samples.rows] + rest
+        bend = self.wiring.bend(dl) if self.beyond is None else self.wiring.bend(dl) + self.beyond
+        opened.solved_bend = bend[self.samples.rows]
+        for each in links[swept:]:
+            if reads_bend(each.effect):
+                opened.rest_bend += stay_back(each, bend, self.samples.histories)[self.samples.rows]
+            else:
+                act([each.on(len(opened))], opened)
         return opened
 
     def solve(
-        self, links: Sequence[Link], rod: PredictedRod, robot: Robot
+        self, links: Sequence[Link], rod: PredictedRod, robot: Robot, tolerance: float = 3.0 * TOLERANCE
     ) -> tuple[PreparedLog, EffectPorts, PredictedPose]:
-        """`_solve` at the tension that it leads to, if effects read it; and this log at that."""
-        place, (opened, pose, tension) = self, self._solve(links, rod, robot)
+        """`_solve` at the tension and the bends that it leads to, if effects read them, up to a `tolerance`
+        [rad, and of the robot's length]; and this log at these."""
+        place, (opened, pose, answer) = self, self._solve(links, rod, robot)
         off = np.full(len(pose.ok), np.inf)
-        for _ in range(_BALANCE if any(reads_tension(each.effect) for each in links) else 0):
-            before, place = pose, place.under(tension, pose.ok)
-            opened, pose, tension = place._solve(links, rod, robot)
+        least, n = approach(links, self.wiring.n_segments), len(pose.ok)
+        part, gap = np.broadcast_to(least, (n,)), (answer.bend - opened.solved_bend).reshape(n, -1)
+        bends = any(reads_bend(each.effect) for each in links)
+        for _ in range(_BALANCE if bends or any(reads_tension(each.effect) for each in links) else 0):
+            before, place = pose, place.under(answer, opened.solved_bend, pose.ok, part)
+            opened, pose, answer = place._solve(links, rod, robot)
+            gap, last = (answer.bend - opened.solved_bend).reshape(n, -1), gap
+            part = relaxed(part, gap, last, least)
             off = np.linalg.norm(pose.position - before.position, axis=1)
-            if not (off[pose.ok] > 3.0 * TOLERANCE * robot.length).any():
+            off = np.maximum(off, robot.length * np.abs(gap).max(1)) if bends else off
+            if not (off[pose.ok] > tolerance * robot.length).any():
                 break
         if place is not self:
-            pose = pose._replace(ok=pose.ok & (off <= 1e3 * TOLERANCE * robot.length))
-        return place.under(tension, pose.ok), opened, pose
+            pose = pose._replace(ok=pose.ok & (off <= 3e2 * tolerance * robot.length))
+        return place.under(answer, opened.solved_bend, pose.ok), opened, pose
 
     def _solve(
         self, links: Sequence[Link], rod: PredictedRod, robot: Robot
-    ) -> tuple[EffectPorts, PredictedPose, Floats]:
+    ) -> tuple[EffectPorts, PredictedPose, RodAnswer]:
         """Ports of the rows after the effects of `links`, those that feel the tip included, and the pose of
-        `robot` at these, with its tension. A row at which such a force and the rod find no balance is not
-        `ok`."""
+        `robot` at these, with what else the rod answers. A row at which such a force and the rod find no
+        balance is not `ok`."""
         felt = [each.on(len(self.samples.rows)) for each in links if feels_tip(each.effect)]
         opened = self.drive(links)
         pose = rod.solve(*self.kernel(opened), robot)
-        tension = rod.tension
+        answer = rod.answer
         if not felt:
-            return opened, pose, tension
+            return opened, pose, answer
         given, force = opened.tip_force, np.zeros_like(opened.tip_force)
         kept = rod.keep()
         step = _FORCE * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2
@@ -314,14 +348,14 @@ class PreparedLog:
             force = force + change
             opened.tip_force = given + force
             before, pose = pose, rod.solve(*self.kernel(opened), robot)
-            tension = rod.tension
+            answer = rod.answer
             # what the rod did beyond its compliance corrects it along the change (Broyden 1965)
             beyond = np.where(pose.ok[:, None], pose.position - before.position - expected, 0.0)
             size = np.maximum((change**2).sum(1), 1e-30)
             by_force = by_force + beyond[:, :, None] * (change / size[:, None])[:, None]
         else:
             pose = pose._replace(ok=pose.ok & (off <= 1e3 * TOLERANCE * robot.length))
-        return opened, pose, tension
+        return opened, pose, answer
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
@@ -336,8 +370,11 @@ class PreparedLog:
         return PredictedPose(*sense(sensing, self.open(), SensedPoses(*pose[:3])), pose.ok)
 
 
-def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
-    """The inputs of the rows of `samples` for `robot`, its tendons grouped into drives as in `wiring`."""
+def prepare_log(
+    samples: LogSamples, robot: Robot, wiring: Routing, like: PreparedLog | None = None
+) -> PreparedLog:
+    """The inputs of the rows of `samples` for `robot`, its tendons grouped into drives as in `wiring`; with
+    the tension and the bends that are known of a robot `like` it."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     reader = Reader(layout, params, rest, len(log))
@@ -353,28 +390,38 @@ def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedL
         reader,
         np.asarray(samples.log.dl),
         matrix_from_quaternion(ports.base_pose[:, 3:]),
+        None if like is None else like.tension,
+        None if like is None else like.beyond,
     )
+
+
+def _of_tendons(one: Link) -> bool:
+    """Whether an effect has a memory of what tendons did."""
+    return one.effect.seam is Seam.ACTUATION and has_memory(one.effect)
 
 
 def effects_at(model: Model, theta: Floats) -> list[Link]:
     """The effects of a model at `theta`, one row of values each, in the order in which they act.
 
-    Raises `InputError` for a memory beyond the tendons: only those are carried over a log.
+    Raises `InputError` for a memory of other things than tendons and bends: only those are carried over a
+    log.
     """
-    n_tendons = model.wiring.n_tendons
-    links = [link(name, values[None], n_tendons) for name, values in model.values(theta).items()]
+    links = [link(name, values[None], model.wiring) for name, values in model.values(theta).items()]
     for each in links:
-        if each.effect.seam is not Seam.ACTUATION and has_memory(each.effect):
+        if has_memory(each.effect) and not (_of_tendons(each) or reads_bend(each.effect)):
             raise InputError(
                 f"effect {each.name!r} has a memory at the seam {each.effect.seam.name}; over a log only "
-                "those of ACTUATION are carried."
+                "those of ACTUATION and those that read the bend are carried."
             )
     return links
 
 
-def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod) -> PredictedPose:
-    """What the camera sees at the rows of `samples`, solved exactly."""
+def predict(
+    model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, like: PreparedLog | None = None
+) -> PredictedPose:
+    """What the camera sees at the rows of `samples`, solved exactly; from a solution nearby where one is
+    given."""
     robot = model.robot_at(theta)
-    place = prepare_log(samples, robot, model.wiring)
+    place = prepare_log(samples, robot, model.wiring, like)
     links = effects_at(model, theta)
     return place.see(place.solve(links, rod, robot)[2], links)

@@ -192,7 +192,8 @@ def effect_unknowns(
         count = wiring.count(parameter.per)
         own = range(at, at + count)
         at += count
-        tied = (parameter.per == "segment" or parameter.shared) and not split and count > 0
+        alike = (parameter.per == "segment" and not parameter.apart) or parameter.shared
+        tied = alike and not split and count > 0
         groups = [(parameter.name, tuple(own))] if tied else [(every[c], (c,)) for c in own]
         if parameter.shared and drive is not None:
             groups = [(every[at - count + drive], (at - count + drive,))]

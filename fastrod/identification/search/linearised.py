@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from fastrod.identification.log.forward import (
     LogSamples,
     PredictedPose,
     PredictedRod,
+    PreparedLog,
     effects_at,
     prepare_log,
 )
@@ -34,6 +35,7 @@ from fastrod.types import Floats
 
 ANGLE = 0.01
 """rad, noise of a measured orientation."""
+_ROUGHLY = 1e-5  # rad, and of the length: of bends and tensions that effects go by
 _BEND = 2e-3  # rad, step of the slopes by bend
 _BALANCE = 3  # Newton steps; a force that is linear in the tip takes one
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
@@ -120,8 +122,15 @@ class LinearisedModel:
     """The model `model` at `theta`, and all models near it."""
 
     def __init__(
-        self, model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, target: Target
+        self,
+        model: Model,
+        theta: Floats,
+        samples: LogSamples,
+        rod: PredictedRod,
+        target: Target,
+        like: LinearisedModel | None = None,
     ) -> None:
+        """`like`: a model nearby, from whose tension and bends it is solved."""
         self.model, self.theta, self.samples, self.rod, self.target = (
             model,
             theta.copy(),
@@ -130,14 +139,16 @@ class LinearisedModel:
             target,
         )
         self.robot = model.robot_at(theta)
-        self.prepared = prepare_log(samples, self.robot, model.wiring)
+        near = None if like is None or like.samples is not samples else like.prepared
+        self.prepared: PreparedLog = prepare_log(samples, self.robot, model.wiring, near)
         self.effects = effects_at(model, theta)
-        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot)
+        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot, _ROUGHLY)
         self._feedback = self._tip_feedback(self.effects, self.pose.position)[0]
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
         at = self.prepared.drive([each for each in self.effects if self.is_light(each.name)])
         self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
+        self._rest = at.rest_bend.copy()
 
     def under(self, target: Target) -> LinearisedModel:
         """The same slopes, weighed otherwise."""
@@ -149,7 +160,7 @@ class LinearisedModel:
         """This model with the slopes of `other`, at a place nearby of the same samples: as many rods as it
         has unknowns are not solved."""
         self._columns = dict(other._columns)
-        for name in ("by_length", "by_force"):
+        for name in ("by_length", "by_force", "by_rest"):
             if name in vars(other):
                 vars(self)[name] = vars(other)[name]
         return self
@@ -160,16 +171,10 @@ class LinearisedModel:
         points = (pose.points - self.pose.points).reshape(len(rotation), -1)
         return np.concatenate([pose.position - self.pose.position, _vector(rotation), points], axis=1)
 
-    def _solved(self, length: Floats | None = None, force: Floats | None = None) -> Floats:
-        opened = self.opened
-        before = opened.tendon_length, opened.tip_force
-        if length is not None:
-            opened.tendon_length = length
-        if force is not None:
-            opened.tip_force = force
+    def _solved(self, **moved: Any) -> Floats:
         self.rod.back(self._kept)
-        pose = self.rod.solve(*self.prepared.kernel(opened), self.robot, self.pose.ok, near=True)
-        opened.tendon_length, opened.tip_force = before
+        ports = self.prepared.kernel(replace(self.opened, **moved))
+        pose = self.rod.solve(*ports, self.robot, self.pose.ok, near=True)
         return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
 
     @cached_property
@@ -186,7 +191,7 @@ class LinearisedModel:
             changes, back = wiring.tendon_change(bends), wiring.bend_from_tendons
             steps = np.full(len(changes), self.rod.fine * _BEND)
         every = [
-            self._solved(length=self.opened.tendon_length + step * change) / step
+            self._solved(tendon_length=self.opened.tendon_length + step * change) / step
             for change, step in zip(changes, steps, strict=True)
         ]
         return np.asarray(np.stack(every, axis=-1) @ back)
@@ -197,8 +202,17 @@ class LinearisedModel:
         size = min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
         step = self.rod.fine * _FORCE * size
         return np.stack(
-            [self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)],
+            [self._solved(tip_force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)],
             axis=-1,
+        )
+
+    @cached_property
+    def by_rest(self) -> Floats:
+        """(n, 6 + 3k, 2 n_segments) per rad of the bend that a segment has without moments."""
+        step, shape = self.rod.fine * _BEND, self.opened.rest_bend.shape[1:]
+        turned = np.eye(math.prod(shape)).reshape(-1, *shape)
+        return np.stack(
+            [self._solved(rest_bend=self.opened.rest_bend + step * one) / step for one in turned], axis=-1
         )
 
     def is_light(self, name: str) -> bool:
@@ -221,7 +235,7 @@ class LinearisedModel:
         before = {
             key: getattr(opened, key).copy()
             for key in CHANGEABLE
-            if key not in ("tendon_length", "tip_force")
+            if key not in ("tendon_length", "tip_force", "rest_bend")
         }
         act([one.on(len(opened))], opened)
         same = all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
@@ -251,7 +265,7 @@ class LinearisedModel:
             place = (
                 self.prepared
                 if unknown.place[0] == "effect"
-                else prepare_log(self.samples, robot, model.wiring)
+                else prepare_log(self.samples, robot, model.wiring, self.prepared)
             )
             self.rod.back(self._kept)
             opened = place.drive(effects_at(model, moved))
@@ -271,6 +285,9 @@ class LinearisedModel:
         force = opened.tip_force - self._force
         if force.any():
             change += np.einsum("nij,nj->ni", self.by_force, force)
+        rest = opened.rest_bend - self._rest
+        if rest.any():
+            change += np.einsum("nij,nj->ni", self.by_rest, rest.reshape(len(rest), -1))
         return change
 
     def solved(self, model: Model, theta: Floats) -> Floats:

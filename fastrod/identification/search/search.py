@@ -13,8 +13,9 @@ from itertools import product
 
 import numpy as np
 
-from fastrod.effects.base import effect_names, get_effect, trait
-from fastrod.identification.log.forward import LogSamples, PredictedRod
+from fastrod.effects.base import effect_names, get_effect, has_memory, trait
+from fastrod.errors import RobotError
+from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
@@ -49,6 +50,7 @@ from fastrod.identification.search.solve import (
     effective_size,
     held_out_losses,
     least_squares,
+    left_out,
     minimise,
     paired,
     rms,
@@ -60,6 +62,7 @@ MOST_PASSES = 4000.0
 """Of each row, on the average, after which nothing new is tried. A log with two effects took 390."""
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
+_LOST = 5.0  # times the own loss of a block that others predict
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
 _REFINED = 6  # candidates that are solved exactly at each stage
@@ -105,7 +108,28 @@ class Search:
         if not np.isfinite(fit.loss):
             return state
         made = self._state(state.model, linearised, fit, state.alternatives)
-        return self.refined(made, 0, borrow=True) if self.rod.of_modes and iterations else made
+        return self.refined(made, 0, borrow=True) if self.rod.of_modes and iterations else self._checked(made)
+
+    def _checked(self, state: ModelState) -> ModelState:
+        """The state with the rod solved for blocks whose parameters the others hardly determine: so far away
+        no slope holds."""
+        fit, losses, n = state.fit, state.losses.copy(), len(state.theta)
+        own = np.bincount(self.block, weights=(fit.residual**2).sum(1), minlength=N_BLOCKS)
+        far = np.flatnonzero(losses > _LOST * own)
+        if not len(far):
+            return state
+        steps = left_out(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
+        for k in far[own[far] > 0.0]:
+            without = fit.theta - steps[k]
+            rows = self.block == k
+            try:
+                theta = np.clip(without[:n], *state.model.limits)
+                pose = predict(state.model, theta, self.samples, self.rod, state.linearised.prepared)
+            except RobotError:
+                continue
+            left = self.target.residual(pose) - state.columns @ without[n:]
+            losses[k] = float((left[rows] ** 2).sum())
+        return replace(state, losses=losses)
 
     def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
         """The model solved at a state's parameters, and these. Of a rod of modes, whose tendons go slack
@@ -117,14 +141,14 @@ class Search:
             mean, sd = model.prior
             return float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
 
-        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
         if self.rod.of_modes and last.model.unknowns == model.unknowns:
             before = cost(last.under(self.target), last.theta)
             for _ in range(_BACK):
                 if cost(linearised, theta) <= before:
                     break
                 theta = 0.5 * (theta + last.theta)
-                linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+                linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
         return linearised, theta
 
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
@@ -641,6 +665,13 @@ def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
             u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)
         ]
         made.append(np.concatenate([state.theta, begin]))
+    # a delay that was fitted before may have stood in for this memory
+    late = [j for j, u in enumerate(state.model.unknowns) if u.name == "latency.delay"]
+    if late and has_memory(get_effect(name)):
+        for start in made[:]:
+            start = start.copy()
+            start[late] = state.model.unknowns[late[0]].mean
+            made.append(start)
     return made
 
 

@@ -195,28 +195,31 @@ def bic(loss: float, n_parameters: int, size: float) -> float:
 def held_out_losses(
     residual: Floats, slopes: Floats, precision: Floats, block: Ints, n_blocks: int
 ) -> Floats:
-    """(n_blocks,) loss of each block predicted from the others, by one Newton step from the fit to all.
-
-    theta_-k = theta - (H - H_k)^-1 J_k^T r_k.
-    """
-    n_out, p = slopes.shape[1], slopes.shape[2]
+    """(n_blocks,) loss of each block predicted from the others, by `left_out` parameters and slopes."""
+    p = slopes.shape[2]
     losses = np.zeros(n_blocks)
     if not p:
         return np.asarray(
             np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64
         )
-    flat = slopes.reshape(-1, p)
+    for k, step in enumerate(left_out(residual, slopes, precision, block, n_blocks)):
+        rows = block == k
+        losses[k] = float(((residual[rows].ravel() + slopes[rows].reshape(-1, p) @ step) ** 2).sum())
+    return losses
+
+
+def left_out(residual: Floats, slopes: Floats, precision: Floats, block: Ints, n_blocks: int) -> Floats:
+    """(n_blocks, p) what each block takes off the parameters: without it they are less by this, by one Newton
+    step from the fit to all, theta_-k = theta - (H - H_k)^-1 J_k^T r_k."""
+    p = slopes.shape[2]
+    flat, steps = slopes.reshape(-1, p), np.zeros((n_blocks, p))
     H = flat.T @ flat + np.diag(precision)
     for k in range(n_blocks):
         rows = block == k
         r, J = residual[rows].ravel(), slopes[rows].reshape(-1, p)
-        if not len(r):
-            continue
-        rest = H - J.T @ J
-        step = _solve(rest + 1e-9 * np.diag(np.diag(H)), J.T @ r)
-        losses[k] = float(((r + J @ step) ** 2).sum())
-    assert n_out >= 1
-    return losses
+        if len(r):
+            steps[k] = _solve(H - J.T @ J + 1e-9 * np.diag(np.diag(H)), J.T @ r)
+    return steps
 
 
 def paired(before: Floats, after: Floats) -> float:
