@@ -16,7 +16,7 @@ from fastrod.effects.base import BodyOperator, Effect, Operator, Seam, get_effec
 from fastrod.effects.ports import EffectPorts
 from fastrod.model.routing import Routing
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.types import Floats
+from fastrod.types import Flags, Floats
 
 
 class SensedPoses(NamedTuple):
@@ -133,6 +133,18 @@ def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> 
             np.broadcast_to(one.values, (len(dl), one.values.shape[1])), change, opened
         )
     opened.shift_tendons(change)
+
+
+def goes_by_bend(links: Iterable[Link], n_segments: int) -> Flags:
+    """(n,) or (1,) whether an effect that reads the bend does anything: one whose sizes are neutral need not
+    know it."""
+    found = np.zeros(1, bool)
+    for each in links:
+        if isinstance(each.effect, BodyOperator):
+            found = found | (each.effect.stiffening(each.values, n_segments) > 0.0)
+        elif reads_bend(each.effect):
+            found = found | each.values.any(1)
+    return found
 
 
 def approach(links: Iterable[Link], n_segments: int) -> Floats:

@@ -209,8 +209,8 @@ class EffectPipeline:
         least = executor.approach(self.links, self.routing.n_segments)
         self._part = least if self._off is None else executor.relaxed(self._part, off, self._off, least)
         self._off = off
-        # what holds nothing back need not remember
-        self._turned = np.where(least < 1.0, np.abs(off).sum(1), 0.0)
+        matters = executor.goes_by_bend(self.links, self.routing.n_segments)
+        self._turned = np.where(matters, np.abs(off).sum(1), 0.0)
         return np.asarray(self._bend + (self._part[:, None] * off).reshape(found.shape))
 
     def _feel(self, opened: EffectPorts, state: Any, compliance: Floats | None, cold: Flags) -> None:

@@ -154,6 +154,7 @@ def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
     assert np.abs(found.position - predicted(bare, what).position).max() > 1e-4
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("tables", [STATIC, [*MEMORIES, *STATIC]], ids=["static", "all"])
 def test_effects_at_once_are_the_simulator(tables: list[dict[str, Any]]) -> None:
     """With static ones before, between and after those with a memory."""

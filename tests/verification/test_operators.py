@@ -232,6 +232,19 @@ def test_a_body_with_friction_stays_where_it_comes_from(spread: float) -> None:
     assert np.ptp(np.array(found) - free * (1.2 / free * np.sin(np.linspace(0.0, 9.0, 40)))) > 1.9 * a
 
 
+def test_a_body_gets_longer_with_the_square_of_its_bend() -> None:
+    """A rod without tendons under a moment: u = M / EI over a length that the bend itself makes."""
+    bare, a = rod("passive"), 0.01
+    sim = Simulator(replace(bare, effects=({"name": "bend_extension", "extension": a},)))
+    (segment,) = bare.segments
+    for moment in (0.01, 0.02):
+        state = sim.settle(tip_moment=(0.0, moment, 0.0), tolerance=1e-11 * bare.length)
+        assert state.ok.all()
+        length = float(state.arclength[0, -1])
+        turned = moment / segment.bending_stiffness[1] * length
+        assert_allclose(length, segment.length + a * turned**2, rtol=0, atol=1e-9)
+
+
 def test_relaxation_after_a_step() -> None:
     # c (1 - exp(-t / tau)) of it comes late: out = 1 - c exp(-t / tau); the step takes no time
     dt = np.concatenate([[0.1, 0.0], np.random.default_rng(5).uniform(0.001, 2.0, 40)])

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.effects.base import Seam, has_memory
+from fastrod.effects.base import BodyOperator, Seam, has_memory
 from fastrod.effects.executor import (
     Link,
     SensedPoses,
@@ -286,7 +286,7 @@ class PreparedLog:
         bend = self.wiring.bend(dl) if self.beyond is None else self.wiring.bend(dl) + self.beyond
         opened.solved_bend = bend[self.samples.rows]
         for each in links[swept:]:
-            if reads_bend(each.effect):
+            if isinstance(each.effect, BodyOperator):
                 opened.rest_bend += stay_back(each, bend, self.samples.histories)[self.samples.rows]
             else:
                 act([each.on(len(opened))], opened)
@@ -417,11 +417,16 @@ def effects_at(model: Model, theta: Floats) -> list[Link]:
 
 
 def predict(
-    model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, like: PreparedLog | None = None
+    model: Model,
+    theta: Floats,
+    samples: LogSamples,
+    rod: PredictedRod,
+    like: PreparedLog | None = None,
+    tolerance: float = 3.0 * TOLERANCE,
 ) -> PredictedPose:
     """What the camera sees at the rows of `samples`, solved exactly; from a solution nearby where one is
-    given."""
+    given, up to the `tolerance` of `PreparedLog.solve`."""
     robot = model.robot_at(theta)
     place = prepare_log(samples, robot, model.wiring, like)
     links = effects_at(model, theta)
-    return place.see(place.solve(links, rod, robot)[2], links)
+    return place.see(place.solve(links, rod, robot, tolerance)[2], links)

@@ -35,7 +35,7 @@ from fastrod.types import Floats
 
 ANGLE = 0.01
 """rad, noise of a measured orientation."""
-_ROUGHLY = 1e-5  # rad, and of the length: of bends and tensions that effects go by
+ROUGHLY = 1e-5  # rad, and of the length: of bends and tensions that effects go by
 _BEND = 2e-3  # rad, step of the slopes by bend
 _BALANCE = 3  # Newton steps; a force that is linear in the tip takes one
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
@@ -142,7 +142,7 @@ class LinearisedModel:
         near = None if like is None or like.samples is not samples else like.prepared
         self.prepared: PreparedLog = prepare_log(samples, self.robot, model.wiring, near)
         self.effects = effects_at(model, theta)
-        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot, _ROUGHLY)
+        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot, ROUGHLY)
         self._feedback = self._tip_feedback(self.effects, self.pose.position)[0]
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}

@@ -19,7 +19,7 @@ from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
-from fastrod.identification.search.linearised import LinearisedModel, Target
+from fastrod.identification.search.linearised import ROUGHLY, LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
     BIC_ACCEPT,
     BIC_KEEP,
@@ -124,7 +124,7 @@ class Search:
             rows = self.block == k
             try:
                 theta = np.clip(without[:n], *state.model.limits)
-                pose = predict(state.model, theta, self.samples, self.rod, state.linearised.prepared)
+                pose = predict(state.model, theta, self.samples, self.rod, state.linearised.prepared, ROUGHLY)
             except RobotError:
                 continue
             left = self.target.residual(pose) - state.columns @ without[n:]
