@@ -139,6 +139,7 @@ class Parameter:
             "",
             self.shape,
             self.shared,
+            self.apart,
         )
 
     @property

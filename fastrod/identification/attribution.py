@@ -182,11 +182,13 @@ def _found(
             log, base = other_tendons(base, _MUCH_LESS * base.left)
         if base.without is None:
             raise
+    begun = time.process_time()
     # beside the best single effect, which may be all; then beside all that were found
     first = _first(base, progressed, most) if max_effects and base.without is None else None
     if first and are_worth_trying(base, left := _left(base, first)) and are_pulled(base):
         log, base = other_tendons(base, (_MUCH_LESS if left < base.left else _LESS) * left)
-    outcome = _searched(base, max_effects, progressed, None if base.without else first)
+    known = None if base.without or first is None else (first, begun)
+    outcome = _searched(base, max_effects, progressed, known)
     left = replace(base, start=outcome.state).left
     in_vain = max_effects and base.without is None and not base.rivals and not outcome.search.spent
     if in_vain and are_worth_trying(base, left):
@@ -212,7 +214,7 @@ def _searched(
     base: BaseFit,
     max_effects: int,
     progressed: Callable[[str, int, int], None],
-    first: SearchStep | None = None,
+    first: tuple[SearchStep, float] | None = None,
 ) -> SearchOutcome:
     """What the search finds beside a base model, and needs."""
     return _needed(base, _candidates(base, max_effects, progressed, first), max_effects)
@@ -222,13 +224,14 @@ def _candidates(
     base: BaseFit,
     max_effects: int,
     progressed: Callable[[str, int, int], None],
-    first: SearchStep | None = None,
+    first: tuple[SearchStep, float] | None = None,
 ) -> SearchOutcome:
     """Effects and alternative patterns that explain the residual of the base model, in the order in which
-    they were found; the `first` stage may be known."""
+    they were found; the `first` stage may be known, with when it was begun [CPU s]."""
     most = max_effects + _SPARE
     search, state, known = base.search, base.start, base.start.model.effects
     names, steps, notes, begun = list[str](), list[SearchStep](), list[str](), time.process_time()
+    step, begun = first or (None, begun)
     for stage in range(most + _MORE_STAGES if max_effects else 0):
         if stage and (taken := time.process_time() - begun) > MOST_SECONDS:
             notes.append(_stopped(stage, taken))
@@ -238,7 +241,7 @@ def _candidates(
             progressed(name, min(done, most), most + 2)
 
         search = replace(search, report=report)
-        step = first if first and stage == 0 else search.stage(state)
+        step = step if step and stage == 0 else search.stage(state)
         if step.taken is None and stage == 0:
             step = _pair(search, state, step, begun) or step
         steps.append(step)

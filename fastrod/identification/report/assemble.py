@@ -20,7 +20,7 @@ from fastrod.identification.report.signature import signatures
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
-from fastrod.identification.search.model_selection import ModelState, SearchStep
+from fastrod.identification.search.model_selection import BIC_STRONG, ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.search import Search, SearchOutcome
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
@@ -35,6 +35,7 @@ ALL_AT_ONCE = 20000
 _MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
 _MOST_ADVICE = 5  # runs
 _BEYOND = 7.0  # times a typical size: no tendon's friction or play is so large
+_Z_EVIDENT = 4.0
 _DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
@@ -119,6 +120,7 @@ def verdict_on(
     """The verdict on what was found, and what remains."""
     library, given = _square(outcome.state), base.without or base
     floor, error = base.noise.floor, explained.test_error
+    named = [s.taken for s in outcome.steps if s.taken and s.taken.name in explained.names]
     classes, (held_out, n_held_out) = _classes(outcome.steps, explained.names), _held_out(explained)
     return choose_verdict(
         base=_square(given.start),
@@ -135,6 +137,7 @@ def verdict_on(
         held_out=(error.before, error.after),
         at_floor=held_out <= _NEAR * floor,
         like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
+        evident=all(one.z > _Z_EVIDENT and one.bic_gain > BIC_STRONG for one in named),
     )
 
 

@@ -56,13 +56,15 @@ def choose_verdict(
     held_out: tuple[float, float] = (float("nan"), float("nan")),
     at_floor: bool | None = None,
     like_noise: bool = False,
+    evident: bool = False,
 ) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
     `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
     above the noise that is left; `held_out`: that error before and after, rms [m]; `at_floor`: whether it is
     the noise's (without it: by the share that is left); `like_noise`: whether so few samples of slow noise
-    may be as large."""
+    may be as large; `evident`: whether each effect is so beyond doubt that it is named beside much that is
+    left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative
@@ -116,8 +118,8 @@ def choose_verdict(
     what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
     if foreign > _FOREIGN or left > _PARTLY:
         names = _listed(found)
-        certain = foreign < 0.5 and left < _UNCERTAIN
-        also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
+        certain = foreign < 0.5 and (left < _UNCERTAIN or evident)
+        also = f" There {'is' if len(found) == 1 else 'are'} {names}, too." if certain else ""
         quantity = "Most" if max(foreign, left) > 0.5 else "A good part"
         return VerdictGrounds(
             "not_in_library",

@@ -35,7 +35,6 @@ from fastrod.types import Floats
 
 ANGLE = 0.01
 """rad, noise of a measured orientation."""
-ROUGHLY = 1e-5  # rad, and of the length: of bends and tensions that effects go by
 _BEND = 2e-3  # rad, step of the slopes by bend
 _BALANCE = 3  # Newton steps; a force that is linear in the tip takes one
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
@@ -142,7 +141,7 @@ class LinearisedModel:
         near = None if like is None or like.samples is not samples else like.prepared
         self.prepared: PreparedLog = prepare_log(samples, self.robot, model.wiring, near)
         self.effects = effects_at(model, theta)
-        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot, ROUGHLY)
+        self.prepared, self.opened, self.pose = self.prepared.solve(self.effects, rod, self.robot, rough=True)
         self._feedback = self._tip_feedback(self.effects, self.pose.position)[0]
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
@@ -232,6 +231,7 @@ class LinearisedModel:
         opened, unknowns = self.prepared.open(), effect_unknowns(name, self.model.wiring)
         alone = Model(self.model.robot, self.model.wiring, (name,), unknowns)
         (one,) = effects_at(alone, alone.start)
+        opened.solved_bend = np.ones_like(opened.rest_bend)
         before = {
             key: getattr(opened, key).copy()
             for key in CHANGEABLE

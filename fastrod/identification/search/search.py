@@ -19,7 +19,7 @@ from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
-from fastrod.identification.search.linearised import ROUGHLY, LinearisedModel, Target
+from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
     BIC_ACCEPT,
     BIC_KEEP,
@@ -124,7 +124,9 @@ class Search:
             rows = self.block == k
             try:
                 theta = np.clip(without[:n], *state.model.limits)
-                pose = predict(state.model, theta, self.samples, self.rod, state.linearised.prepared, ROUGHLY)
+                pose = predict(
+                    state.model, theta, self.samples, self.rod, state.linearised.prepared, rough=True
+                )
             except RobotError:
                 continue
             left = self.target.residual(pose) - state.columns @ without[n:]
@@ -142,12 +144,14 @@ class Search:
             return float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
 
         linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
-        if self.rod.of_modes and last.model.unknowns == model.unknowns:
-            before = cost(last.under(self.target), last.theta)
+        if self.rod.of_modes:
+            known = {u.name: number for u, number in zip(last.model.unknowns, last.theta, strict=True)}
+            there = np.array([known.get(u.name, u.outside(u.mean)) for u in model.unknowns])
+            before = cost(last.under(self.target), there)
             for _ in range(_BACK):
                 if cost(linearised, theta) <= before:
                     break
-                theta = 0.5 * (theta + last.theta)
+                theta = 0.5 * (theta + there)
                 linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
         return linearised, theta
 
