@@ -26,6 +26,7 @@ import numpy as np
 
 from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError, UnknownNameError, nearest, shown
+from fastrod.kernels.operators import yielding
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
@@ -260,30 +261,51 @@ class Operator(Law, ABC):
         return swept
 
 
-class BodyOperator(Law, ABC):
-    """Base of effects with a memory of how the body was bent: operators on the solved bends over time.
+class BodyOperator(Law):
+    """Base of effects with a memory of how the body was bent: elements of dry friction in parallel, in each
+    segment and in its plane, that hold back what the solved bend has dragged along.
 
-    A simulator calls `sweep` with one step, identification with a whole log.
+    The parameters are a size for each segment and a width [rad]; with several `elements` a spread, by which
+    their widths lie apart (in the logarithm). A simulator calls `sweep` with one step, identification with a
+    whole log.
     """
 
     seam = Seam.MATERIAL
     reads_bend = True
+    elements: ClassVar[int] = 1
 
-    @abstractmethod
+    def memory(self, n_robots: int, n_bends: int) -> Floats:
+        """Where each element has been dragged to [rad]; nan: it is at rest at the first bend."""
+        return np.full((n_robots, self.elements * n_bends), np.nan)
+
     def sweep(self, values: Floats, memory: Floats, bend: Floats) -> Floats:
         """(n_robots, n_steps, n_segments, 2) the bend that stays back [rad], from that which the rod has,
-        `bend` of the same shape. `memory` (n_robots, m) is changed in place; nan in it means that the body
-        was at rest at the first step."""
-        ...
+        `bend` of the same shape; `memory` is changed in place."""
+        size, width, spread = self._split(values, bend.shape[2])
+        places, back = memory.reshape(len(bend), self.elements, -1), np.zeros_like(bend)
+        at_rest, all_of_it = bend[:, 0].reshape(len(bend), -1), -np.ones(size.shape)
+        for j, at in enumerate(np.linspace(-1.0, 1.0, self.elements) if self.elements > 1 else [0.0]):
+            own = width * np.exp(at * spread)
+            place = np.where(np.isnan(places[:, j]), at_rest, places[:, j])
+            off = bend.copy()  # from what is dragged along
+            yielding(off, place, all_of_it, own * np.ones(size.shape))
+            places[:, j] = place
+            back += off / own[:, None, :, None]
+        return np.asarray(-size[:, None, :, None] * back / self.elements)
 
-    @abstractmethod
     def stiffening(self, values: Floats, n_segments: int) -> Floats:
         """(n_robots,) times the body's own stiffness by which it is stiffer where nothing slides."""
-        ...
+        size, width, spread = self._split(values, n_segments)
+        return np.asarray((size * np.exp(spread) / width).max(1))
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
         ports.rest_bend += self.sweep(values, memory, ports.solved_bend[:, None])[:, 0]
+
+    def _split(self, values: Floats, n_segments: int) -> tuple[Floats, Floats, Floats]:
+        """Sizes (n_robots, n_segments), width and spread (n_robots, 1)."""
+        size, width, spread = np.split(values, [n_segments, n_segments + 1], axis=1)
+        return size, width, spread if self.elements > 1 else np.zeros_like(width)
 
 
 _REGISTRY: dict[str, Effect] = {}

@@ -158,11 +158,11 @@ def approach(links: Iterable[Link], n_segments: int) -> Floats:
     return 1.0 / (1.0 + stiffer)
 
 
-def relaxed(part: Floats, off: Floats, before: Floats, least: Floats) -> Floats:
-    """(n,) part of the way to go next, from that of the last time and how far bends (n, k) were off then and
-    are now [rad] (Aitken's rule for vectors, Irons and Tuck 1969)."""
+def relaxed(fraction: Floats, off: Floats, before: Floats, least: Floats) -> Floats:
+    """(n,) fraction of the way to go next, from that of the last time and how far bends (n, k) were off then
+    and are now [rad] (Aitken's rule for vectors, Irons and Tuck 1969)."""
     gone = off - before
-    found = -part * (before * gone).sum(1) / np.maximum((gone**2).sum(1), 1e-30)
+    found = -fraction * (before * gone).sum(1) / np.maximum((gone**2).sum(1), 1e-30)
     return np.asarray(np.clip(found, least, 1.0))
 
 

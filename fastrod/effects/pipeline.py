@@ -90,7 +90,7 @@ class EffectPipeline:
         self._tension = np.zeros((n_robots, self.routing.n_tendons))
         self._reads_bend = any(executor.reads_bend(link.effect) for link in self.links)
         self._bend = np.zeros((n_robots, self.routing.n_segments, 2))
-        self._part = np.ones(n_robots)
+        self._fraction = np.ones(n_robots)
         self._off: Floats | None = None
         self._lengths: Floats | None = None
         self._turned = np.zeros(n_robots)
@@ -207,11 +207,13 @@ class EffectPipeline:
         """The bends to go by next, on the way to those that were `found`; how far that is, in `_turned`."""
         off = (found - self._bend).reshape(len(found), -1)
         least = executor.approach(self.links, self.routing.n_segments)
-        self._part = least if self._off is None else executor.relaxed(self._part, off, self._off, least)
+        self._fraction = (
+            least if self._off is None else executor.relaxed(self._fraction, off, self._off, least)
+        )
         self._off = off
         matters = executor.goes_by_bend(self.links, self.routing.n_segments)
         self._turned = np.where(matters, np.abs(off).sum(1), 0.0)
-        return np.asarray(self._bend + (self._part[:, None] * off).reshape(found.shape))
+        return np.asarray(self._bend + (self._fraction[:, None] * off).reshape(found.shape))
 
     def _feel(self, opened: EffectPorts, state: Any, compliance: Floats | None, cold: Flags) -> None:
         """Add the force of effects that feel the tip, a Newton step nearer to balance; the first of them

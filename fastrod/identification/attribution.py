@@ -46,8 +46,9 @@ _SPARE = 2
 # of what the best single effect leaves, and of what is left where none is certain or all were found: a robot
 # of other tendons that leaves less is the one to go on with
 _MUCH_LESS, _LESS = 0.8, 0.9
-MOST_SECONDS = 25.0
-"""CPU s of a search, after which it begins no further stage; most logs take 5."""
+MOST_SECONDS = 60.0
+"""CPU s of a search: it begins no further stage that would end later if it took as long as the last one; most
+logs take 5."""
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -232,10 +233,13 @@ def _candidates(
     search, state, known = base.search, base.start, base.start.model.effects
     names, steps, notes, begun = list[str](), list[SearchStep](), list[str](), time.process_time()
     step, begun = first or (None, begun)
+    last = 0.0
     for stage in range(most + _MORE_STAGES if max_effects else 0):
-        if stage and (taken := time.process_time() - begun) > MOST_SECONDS:
+        taken = time.process_time() - begun
+        if stage and taken + (taken - last) > MOST_SECONDS:
             notes.append(_stopped(stage, taken))
             break
+        last = taken if stage else 0.0
 
         def report(name: str, done: int = stage + 1) -> None:
             progressed(name, min(done, most), most + 2)
@@ -282,7 +286,7 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
         while (
             state.alternatives
             and len(found) < max_effects
-            and time.process_time() - begun < MOST_SECONDS
+            and time.process_time() - begun < 0.5 * MOST_SECONDS
             and alone.fit.loss * float((search.target.sigma**2).mean()) > 2.0 * noise
         ):
             step = search.stage(alone, with_alternatives=False)

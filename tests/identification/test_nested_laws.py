@@ -10,7 +10,7 @@ import pytest
 from identification.logs import log_of, one_segment
 from numpy.testing import assert_allclose
 
-from fastrod.effects.base import effect_names, get_effect, read_values, trait
+from fastrod.effects.base import BodyOperator, effect_names, get_effect, read_values, trait
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.replay import replay
@@ -49,6 +49,17 @@ def test_a_law_is_the_one_that_it_contains_where_it_says(name: str) -> None:
     what: Any = get_effect(name)
     for inner, where in what.nests.items():
         sub: Any = get_effect(inner)
+        if isinstance(what, BodyOperator):
+            both = [
+                law.sweep(read_values(label, table, wiring, "test")[None], law.memory(1, 2), bends[None])
+                for law, label, table in (
+                    (sub, inner, {"bend": 0.1, "width": 0.05}),
+                    (what, name, {"bend": 0.1, "width": 0.05, **where}),
+                )
+            ]
+            assert np.abs(both[0]).max() > 0.09
+            assert_allclose(*both, rtol=0, atol=1e-14)
+            continue
         size = 0.05 * float(wiring.tendon_offset.mean())
         plain = {"rounding": 0.0} if inner == "backlash" else {}
         one = {"half_width": size, "start": [0.5, -1.0], **plain}

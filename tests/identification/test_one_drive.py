@@ -50,7 +50,7 @@ def test_a_worn_drive_moves_its_own_tendons_alone(name: str) -> None:
         if isinstance(what, Operator):
             return what.sweep(values, what.memory(1, robot.n_tendons), dl[None], dt, wiring)[0]
         opened = prepare_log(sample(log_of(robot, dl)), robot, wiring).open()
-        act([link(name, values, robot.n_tendons).on(len(opened))], opened)
+        act([link(name, values, wiring).on(len(opened))], opened)
         return np.asarray(opened.dl)
 
     every = after(tuple(range(1, n + 1)))

@@ -51,7 +51,7 @@ def at_the_limit() -> LogSamples:
         rod = PredictedRod(samples, robot())
         model = base_model(robot())
         assert predict(model, model.start, samples, rod).ok.all()
-        return rod.tension[:, 1]
+        return rod.answer.tension[:, 1]
 
     for _ in range(8):
         middle = 0.5 * (low + high)

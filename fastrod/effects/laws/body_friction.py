@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-import numpy as np
-
-from fastrod.effects.base import BodyOperator, Parameter, Signal, effect
-from fastrod.kernels.operators import yielding
-from fastrod.types import Floats
+from fastrod.effects.base import BodyOperator, Parameter, effect
 
 
 @effect
@@ -28,7 +24,7 @@ class BodyFriction(BodyOperator):
     """
 
     order = 35.0
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "bend", "rad", bounds=(0.0, 1.0), typical=0.02, starts=(0.01, 0.04), per="segment", apart=True
         ),
@@ -37,40 +33,11 @@ class BodyFriction(BodyOperator):
         ),
     )
     excited_by = "the same poses from several sides, with elastic tendons or tendons that go slack"
-    confounded_with: ClassVar[tuple[str, ...]] = ("friction", "backlash", "creep", "plastic_set")
-    synonyms: ClassVar[tuple[str, ...]] = ("internal_friction",)
+    confounded_with = ("friction", "backlash", "creep", "plastic_set")
+    synonyms = ("internal_friction",)
     separated_by: ClassVar[Mapping[str, str]] = {
         "friction": "a segment bent by others' tendons while its own hold still: only friction of the body "
         "shows there",
         "backlash": "tendons brought back to their zeros from several sides",
         "creep": "holds of 10 s and more: friction stays, creep decays",
     }
-    signal = Signal.LOOP
-    frequent = True
-
-    elements: ClassVar[int] = 1
-
-    def memory(self, n_robots: int, n_bends: int) -> Floats:
-        return np.full((n_robots, self.elements * n_bends), np.nan)
-
-    def sweep(self, values: Floats, memory: Floats, bend: Floats) -> Floats:
-        size, width, spread = self.split(values, bend.shape[2])
-        places, back = memory.reshape(len(bend), self.elements, -1), np.zeros_like(bend)
-        all_of_it = -np.ones(size.shape)
-        for j, at in enumerate(np.linspace(-1.0, 1.0, self.elements) if self.elements > 1 else [0.0]):
-            own = width * np.exp(at * spread)
-            place = places[:, j].copy()
-            place[np.isnan(place)] = bend[:, 0].reshape(len(bend), -1)[np.isnan(place)]
-            off = bend.copy()  # from what is dragged along
-            yielding(off, place, all_of_it, own * np.ones(size.shape))
-            places[:, j] = place
-            back += off / own[:, None, :, None]
-        return np.asarray(-size[:, None, :, None] * back / self.elements)
-
-    def stiffening(self, values: Floats, n_segments: int) -> Floats:
-        size, width, spread = self.split(values, n_segments)
-        return np.asarray((size * np.exp(spread) / width).max(1))
-
-    def split(self, values: Floats, n_segments: int) -> tuple[Floats, Floats, Floats]:
-        """Size (n_robots, n_segments) [rad], and width [rad] and spread (n_robots, 1) of the elements."""
-        return values[:, :n_segments], values[:, n_segments : n_segments + 1], np.zeros((len(values), 1))

@@ -234,11 +234,15 @@ class PreparedLog:
             self.ports, len(self.samples.rows), self.samples.time[self.samples.rows], self.base_rotation
         )
 
-    def under(self, answer: RodAnswer, asked: Floats, ok: Flags, part: Floats | None = None) -> PreparedLog:
-        """The same with the tension and the bends of a solution, of the rows that are `ok`, the bends `part`
-        (n_rows,) of the way; effects had gone by `asked` (n_rows, n_segments, 2)."""
-        off = (answer.bend - asked).reshape(len(ok), -1)
-        off = self._between(off if part is None else part[:, None] * off, ok).reshape(-1, *asked.shape[1:])
+    def under(
+        self, answer: RodAnswer, requested: Floats, ok: Flags, fraction: Floats | None = None
+    ) -> PreparedLog:
+        """The same with the tension and the bends of a solution, of the rows that are `ok`, the bends a
+        `fraction` (n_rows,) of the way; effects had gone by `requested` (n_rows, n_segments, 2)."""
+        off = (answer.bend - requested).reshape(len(ok), -1)
+        off = self._between(off if fraction is None else fraction[:, None] * off, ok).reshape(
+            -1, *requested.shape[1:]
+        )
         beyond = off if self.beyond is None else self.beyond + off
         return replace(self, tension=self._between(answer.tension, ok), beyond=beyond)
 
@@ -302,13 +306,13 @@ class PreparedLog:
         place, (opened, pose, answer) = self, self._solve(links, rod, robot)
         off = np.full(len(pose.ok), np.inf)
         least, n = approach(links, self.wiring.n_segments), len(pose.ok)
-        part, gap = np.broadcast_to(least, (n,)), (answer.bend - opened.solved_bend).reshape(n, -1)
+        fraction, gap = np.broadcast_to(least, (n,)), (answer.bend - opened.solved_bend).reshape(n, -1)
         bends = any(reads_bend(each.effect) for each in links)
         for _ in range(_BALANCE if bends or any(reads_tension(each.effect) for each in links) else 0):
-            before, place = pose, place.under(answer, opened.solved_bend, pose.ok, part)
+            before, place = pose, place.under(answer, opened.solved_bend, pose.ok, fraction)
             opened, pose, answer = place._solve(links, rod, robot)
             gap, last = (answer.bend - opened.solved_bend).reshape(n, -1), gap
-            part = relaxed(part, gap, last, least)
+            fraction = relaxed(fraction, gap, last, least)
             off = np.linalg.norm(pose.position - before.position, axis=1)
             if bends:
                 off = np.maximum(off, robot.length * np.abs(gap).max(1) * tolerance / turned)

@@ -48,10 +48,11 @@ def signatures(
         side /= max(float(np.linalg.norm(side)), 1e-12)
         across = np.cross(axis, side)
         directions = {"along the bend": side, "across the bend": across, "along the base's axis": axis}
-    way = max(directions, key=lambda way: float(np.abs(shift @ directions[way]).max()))
+    direction = max(directions, key=lambda direction: float(np.abs(shift @ directions[direction]).max()))
     found = [(name, shift), *((other, _shift(other, its, samples)[0]) for other, its in rivals)]
     return [
-        Signature(each, signal, moved @ directions[way], label, f"tip moved {way}") for each, moved in found
+        Signature(each, signal, moved @ directions[direction], label, f"tip moved {direction}")
+        for each, moved in found
     ]
 
 
@@ -62,11 +63,11 @@ def _commands(name: str, state: ModelState, log: RunLog) -> tuple[LogSamples, Fl
     bend = wiring.bend(np.asarray(log.dl))
     size = np.linalg.norm(bend, axis=-1).max(axis=0)
     k = int(np.argmax(size))
-    way = np.zeros(bend.shape[1:])
-    way[k, int(np.argmax(np.abs(bend[:, k]).max(axis=0)))] = size[k]
+    direction = np.zeros(bend.shape[1:])
+    direction[k, int(np.argmax(np.abs(bend[:, k]).max(axis=0)))] = size[k]
     if (drive := state.model.drive_of(name)) is not None:
         alone = wiring.bend(wiring.drive_sign * wiring.by_tendon(np.eye(wiring.n_drives)[drive]))
-        way = size.max() * alone / np.abs(alone).max()
+        direction = size.max() * alone / np.abs(alone).max()
     peaks = np.array(_PEAKS)
     path = np.append(0.0, np.cumsum(np.abs(np.diff(peaks))))
     swing = np.interp(np.linspace(0.0, path[-1], _ROWS), path, peaks)
@@ -75,12 +76,12 @@ def _commands(name: str, state: ModelState, log: RunLog) -> tuple[LogSamples, Fl
         float(np.median(moving[moving > _LEAST_SPEED])) if (moving > _LEAST_SPEED).any() else 0.0,
         _LEAST_SPEED,
     )
-    t = np.linspace(0.0, path[-1] * float(np.abs(way).max()) / speed, _ROWS)
-    signal, label = np.degrees(swing * float(np.abs(way).max())), "commanded bend [°]"
+    t = np.linspace(0.0, path[-1] * float(np.abs(direction).max()) / speed, _ROWS)
+    signal, label = np.degrees(swing * float(np.abs(direction).max())), "commanded bend [°]"
     if _of_time(name):
         t = np.linspace(0.0, float(np.ptp(log.t)), _ROWS)
         signal, label, swing = t, "time [s]", 0.0 * swing
-    dl = wiring.tendon_change(swing[:, None, None] * way)
+    dl = wiring.tendon_change(swing[:, None, None] * direction)
     made = RunLog(name=name, t=t, run=np.full(_ROWS, ""), dl=dl, tip_position=np.zeros((_ROWS, 3)))
     return sample(made), signal, label
 
