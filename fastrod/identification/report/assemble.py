@@ -35,7 +35,7 @@ ALL_AT_ONCE = 20000
 _MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
 _MOST_ADVICE = 5  # runs
 _BEYOND = 7.0  # times a typical size: no tendon's friction or play is so large
-_Z_EVIDENT = 4.0
+_Z_EVIDENT, _FALLS = 4.0, 0.97  # and of the held-out error
 _DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
@@ -137,7 +137,8 @@ def verdict_on(
         held_out=(error.before, error.after),
         at_floor=held_out <= _NEAR * floor,
         like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
-        evident=all(one.z > _Z_EVIDENT and one.bic_gain > BIC_STRONG for one in named),
+        evident=error.after < _FALLS * error.before
+        and all(one.z > _Z_EVIDENT and one.bic_gain > BIC_STRONG for one in named),
     )
 
 
