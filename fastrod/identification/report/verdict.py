@@ -20,6 +20,7 @@ _EXPLAINED, _PARTLY = 0.03, 0.45
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
 # of the error above the noise: patterns outside the library that carry this much are the finding
 _FOREIGN = 0.3
+_AT = 1.02  # of the noise: a held-out error within it is the noise's
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
 _NO_NOISE = 9.0  # of the noise's variance: so much is none, however white
@@ -110,7 +111,8 @@ def choose_verdict(
             False,
         )
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
-    done = left <= _EXPLAINED if at_floor is None else at_floor and foreign <= _EXPLAINED
+    below = held_out[1] <= _AT * float(np.sqrt(floor))  # a pattern of the fit is none where nothing is left
+    done = left <= _EXPLAINED if at_floor is None else at_floor and (foreign <= _EXPLAINED or below)
     if done:
         said = f"{_cut(found, held_out, base, library, floor)}."
         # at the noise no pattern is named
