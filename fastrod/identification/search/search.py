@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from fastrod.effects.base import effect_names, get_effect, has_memory, trait
+from fastrod.effects.base import BodyOperator, effect_names, get_effect, has_memory, trait
 from fastrod.errors import RobotError
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.unknowns import Model
@@ -55,6 +55,7 @@ from fastrod.identification.search.solve import (
     paired,
     rms,
 )
+from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
 
 N_BLOCKS = 20
@@ -62,6 +63,7 @@ MOST_PASSES = 4000.0
 """Of each row, on the average, after which nothing new is tried. A log with two effects took 390."""
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
+_STIFF = 0.01  # of a segment's own stiffness, over that of a tendon
 _LOST = 5.0  # times the own loss of a block that others predict
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
@@ -116,7 +118,7 @@ class Search:
         fit, losses, n = state.fit, state.losses.copy(), len(state.theta)
         own = np.bincount(self.block, weights=(fit.residual**2).sum(1), minlength=N_BLOCKS)
         far = np.flatnonzero(losses > _LOST * own)
-        if not len(far):
+        if not len(far) or not self.rod.of_modes:
             return state
         steps = left_out(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
         for k in far[own[far] > 0.0]:
@@ -449,6 +451,7 @@ class Search:
         """Effects that may be tried."""
         n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
         refined = {trait(get_effect(name), "refines") for name in state.model.effects}
+        held = not _gives_way(state.linearised.robot)
         return [
             name
             for name in effect_names()
@@ -458,6 +461,7 @@ class Search:
             and not trait(get_effect(name), "by_pattern")
             and name not in self.excluded
             and trait(get_effect(name), "least_segments") <= n_segments
+            and not (held and isinstance(get_effect(name), BodyOperator))
             and (driven or get_effect(name).seam.name != "ACTUATION")
         ]
 
@@ -642,6 +646,18 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _gives_way(robot: Robot) -> bool:
+    """Whether the tendons let the body bend otherwise than they say: they go slack, or stretch by some of
+    what a segment's own stiffness asks for. Else nothing shows what the body holds back."""
+    ends = zip(robot.tendons, robot.tendon_segment, strict=True)
+    return any(
+        t.unilateral
+        or t.compliance * float(np.mean(robot.segments[k].bending_stiffness))
+        > _STIFF * float(np.mean(t.offset)) ** 2 * robot.segments[k].length
+        for t, k in ends
+    )
 
 
 def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
