@@ -196,8 +196,6 @@ def _found(
         log, base = other_tendons(base, _LESS * left)
         if base.without:
             outcome = _searched(base, max_effects, progressed)
-    if base.left <= base.noise.floor and base.without is None:  # what a fit finds in that is noise
-        outcome = replace(outcome, state=outcome.start, names=())
     return log, base, outcome
 
 

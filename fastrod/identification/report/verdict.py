@@ -87,8 +87,6 @@ def choose_verdict(
     down_to_noise = (
         "The model explains this log down to its noise; nothing is missing that this log could show."
     )
-    if found and base <= floor and held_out[0] <= float(np.sqrt(floor)):  # what it had before is noise
-        return VerdictGrounds("none", down_to_noise, "none", 0.0, (), True)
     if not found and not alternatives:
         white = structure.structured <= CLEAN or like_noise
         if white and not like_noise and base > _NO_NOISE * floor:
