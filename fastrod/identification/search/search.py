@@ -451,7 +451,7 @@ class Search:
         """Effects that may be tried."""
         n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
         refined = {trait(get_effect(name), "refines") for name in state.model.effects}
-        held = not _gives_way(state.linearised.robot)
+        held = not _yields(state.linearised.robot)
         return [
             name
             for name in effect_names()
@@ -648,7 +648,7 @@ class Search:
         return made
 
 
-def _gives_way(robot: Robot) -> bool:
+def _yields(robot: Robot) -> bool:
     """Whether the tendons let the body bend otherwise than they say: they go slack, or stretch by some of
     what a segment's own stiffness asks for. Else nothing shows what the body holds back."""
     ends = zip(robot.tendons, robot.tendon_segment, strict=True)
