@@ -451,7 +451,7 @@ class Search:
         """Effects that may be tried."""
         n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
         refined = {trait(get_effect(name), "refines") for name in state.model.effects}
-        held = not _yields(state.linearised.robot)
+        held = not _yields(state.model.robot)
         return [
             name
             for name in effect_names()
