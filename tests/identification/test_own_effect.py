@@ -72,7 +72,7 @@ def package(tmp_path: Path) -> Iterator[None]:
 
 def tried(robot: Robot) -> list[str]:
     """Names that a search tries on a robot."""
-    model: Any = SimpleNamespace(wiring=route(robot), effects=())
+    model: Any = SimpleNamespace(robot=robot, wiring=route(robot), effects=())
     return Search.names(SimpleNamespace(excluded=()), SimpleNamespace(model=model))
 
 
