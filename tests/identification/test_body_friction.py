@@ -1,4 +1,4 @@
-"""Friction of the body, told from friction of the tendons by what the solved rod remembers."""
+"""Friction of the body, distinguished from friction of the tendons by what the solved rod remembers."""
 
 from __future__ import annotations
 

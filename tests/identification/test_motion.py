@@ -182,9 +182,6 @@ def test_a_payload_is_a_mass_at_the_tip() -> None:
 
 
 @pytest.mark.study
-@pytest.mark.xfail(
-    reason="stretch is known to 73 N beside a prior of 150 N since rods carry bends; not understood"
-)
 def test_what_rest_shows_is_fitted_at_rest() -> None:
     """Stretch and a lump's mass, from tips at rest: neither needs a time step."""
     plant, commanded = robot(**TRUE), 1.5 * commands(1, np.arange(80) * 0.025)

@@ -132,9 +132,12 @@ def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
 
 def read_everywhere(samples: LogSamples, residual: Floats, noise: Noise) -> Noise:
     """Coloured noise that rests are too short to know, from all of a `residual` (n_rows, 3) [m] where this is
-    no larger than the `noise` at rest may be; never more than what the residual is."""
+    no larger than the `noise` at rest may be; never more than what the residual is. White noise of a robot
+    that never rests, no more than this residual jumps."""
     if not noise.model.order:
-        return noise
+        if sum(len(rows) for rows in at_rest(samples)) >= ENOUGH:
+            return noise
+        return replace(noise, sigma=np.minimum(noise.sigma, _fast(np.diff(residual, n=3, axis=0))))
     size = np.sqrt(np.mean(residual[keep(samples, residual, noise)] ** 2, axis=0))
     if noise.uncertainty > _KNOWN and np.sqrt((size**2).sum()) < noise.floor * (
         1.0 + _WITHIN * noise.uncertainty

@@ -115,7 +115,7 @@ def fit_base(
     size = max(1.0, rms(target.residual(linearised.pose)))
     search = replace(search, target=target.weighed(noise.sigma * size, noise.sigma))
     state = search.start(model, theta)
-    if noise.model.order and not declared > 0.0 and not rival:
+    if not declared > 0.0 and not rival:
         every = samples.on(rows[:_FOR_NOISE])
         pose = predict(state.model, state.theta, every, PredictedRod(every, robot, threads=threads))
         left = np.asarray(every.log.tip_position)[every.rows] - pose.position
