@@ -40,7 +40,8 @@ class Found:
     drive: int | None = None
     """The one drive that has it, from 1 on; None where it is not one drive's."""
     signatures: Sequence[Signature] = ()
-    """What it does by itself, then what the effects do that it cannot be distinguished from; empty without tendons."""
+    """What it does by itself, then what the effects do that it cannot be distinguished from; empty without
+    tendons."""
 
 
 @dataclass(frozen=True, kw_only=True)
