@@ -14,13 +14,12 @@ from fastrod.types import Floats
 class BendExtension(Static):
     """The body gets longer as it bends.
 
-    The neutral axis moves to the inner side: what is pressed gives way less than what is pulled. It goes by
-    the bend of the solved rod, as `body_friction` does.
+    Perhaps the neutral axis moves to the inner side, where what is pressed gives way less than what is
+    pulled. It goes by the bend of the solved rod, as `body_friction` does.
 
     Equation: l_k -> l_k + a_k theta_k^2, in each segment
     Symbols: a extension, theta_k the solved bend of segment k, l_k its length
-    Source: second order in the bend of a section whose stiffness differs in tension and compression
-    (Timoshenko and Gere 1961, bimodulus beams: Ambartsumyan 1986)
+    Source: the first even term in the bend; found on a measured trunk, its cause is a guess
     Residual signature: along the tangent, even in the bend; tendons that stretch let it show
     """
 
@@ -40,7 +39,6 @@ class BendExtension(Static):
     )
     excited_by = "wide bends in every direction"
     confounded_with = ("axial_compression", "stiffening", "marker_offset")
-    synonyms = ("bending_lengthens",)
     separated_by: ClassVar[Mapping[str, str]] = {
         "axial_compression": "all tendons pulled together: only compression shows there",
         "stiffening": "a marker at half length, or the tip's orientation",

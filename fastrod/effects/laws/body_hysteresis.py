@@ -16,7 +16,7 @@ class BodyHysteresis(BodyOperator):
     Equation: u* -> u* - a mean z_j / l, z_j = (theta - p_j) / w_j, p_j dragged along once |theta - p_j| >
     w_j, w_j over w e^(-+s)
     Symbols: a bend, w width, s spread, theta (about d1 and d2) the solved bend of a segment and l its length
-    Source: Iwan 1966, Prandtl and Ishlinskii (elements in parallel); rounded loops as Bouc 1967 and Wen 1976
+    Source: Iwan 1966, Prandtl and Ishlinskii (elements in parallel)
     Residual signature: as friction of the body, with loops that are round and nested
     """
 
@@ -34,7 +34,7 @@ class BodyHysteresis(BodyOperator):
     excited_by = "reversals of many sizes, with elastic tendons or tendons that go slack"
     confounded_with = ("body_friction", "creep")
     refines = "body_friction"
-    synonyms = ("bouc_wen", "material_hysteresis")
+    synonyms = ("material_hysteresis",)
     nests: ClassVar[Mapping[str, Mapping[str, str | float]]] = {"body_friction": {"spread": 0.0}}
     separated_by: ClassVar[Mapping[str, str]] = {
         "body_friction": "reversals of many sizes: with many elements small loops are thin and closed"

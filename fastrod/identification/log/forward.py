@@ -301,7 +301,8 @@ class PreparedLog:
         self, links: Sequence[Link], rod: PredictedRod, robot: Robot, rough: bool = False
     ) -> tuple[PreparedLog, EffectPorts, PredictedPose]:
         """`_solve` at the tension and the bends that it leads to, if effects read them, and this log at
-        these; a `rough` one leaves less than any camera sees, at a third of the time."""
+        these. A `rough` one is for slopes and for comparing candidates, at a third of the time: bends may be
+        off by 1e-3 rad."""
         tolerance, turned = _ROUGH if rough else (3.0 * TOLERANCE, 3.0 * TOLERANCE)
         place, (opened, pose, answer) = self, self._solve(links, rod, robot)
         off = np.full(len(pose.ok), np.inf)

@@ -84,9 +84,6 @@ def choose_verdict(
         if alternatives and foreign >= structured
         else structure.kind
     )
-    down_to_noise = (
-        "The model explains this log down to its noise; nothing is missing that this log could show."
-    )
     if not found and not alternatives:
         white = structure.structured <= CLEAN or like_noise
         if white and not like_noise and base > _NO_NOISE * floor:
@@ -94,7 +91,10 @@ def choose_verdict(
             said = f"What the model leaves is {times:.3g} times the noise, in no pattern that the test tells."
             return VerdictGrounds("not_in_library", said, "unknown", 1.0, (), False)
         if white:
-            return VerdictGrounds("none", down_to_noise, "none", 0.0, (), False)
+            said = (
+                "The model explains this log down to its noise; nothing is missing that this log could show."
+            )
+            return VerdictGrounds("none", said, "none", 0.0, (), False)
         why = "Structure remains in the residual that no effect of the library explains"
         return VerdictGrounds("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
     if not found:

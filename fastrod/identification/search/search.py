@@ -120,7 +120,7 @@ class Search:
         far = np.flatnonzero(losses > _LOST * own)
         if not len(far) or not self.rod.of_modes:
             return state
-        steps = left_out(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
+        steps, kept = left_out(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS), self.rod.keep()
         for k in far[own[far] > 0.0]:
             without = fit.theta - steps[k]
             rows = self.block == k
@@ -133,6 +133,7 @@ class Search:
                 continue
             left = self.target.residual(pose) - state.columns @ without[n:]
             losses[k] = float((left[rows] ** 2).sum())
+            self.rod.back(kept)  # the next solve begins near, not from so far away
         return replace(state, losses=losses)
 
     def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
