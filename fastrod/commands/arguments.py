@@ -139,6 +139,11 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         help="fit the camera's registration, marker offset and latency too",
     )
     identify.add_argument(
+        "--only-session",
+        action="store_true",
+        help="fit this session's zeros, registration and delay alone, of a robot identified before",
+    )
+    identify.add_argument(
         "--dynamics",
         action="store_true",
         help="fit the robot's own parameters in motion; no effect is tried (needs line_density)",

@@ -140,6 +140,7 @@ def _identify(arguments: argparse.Namespace) -> int:
             free_camera=arguments.free_camera,
             network=arguments.network,
             dynamics=arguments.dynamics,
+            only_session=arguments.only_session,
             progress=bar or _lines(),
         )
     written = [] if out is None else report.write(result, out)

@@ -16,7 +16,7 @@ from fastrod.effects.base import BodyOperator, Effect, Operator, Seam, get_effec
 from fastrod.effects.ports import EffectPorts
 from fastrod.model.routing import Routing
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.types import Flags, Floats
+from fastrod.types import Flags, Floats, Ints
 
 
 class SensedPoses(NamedTuple):
@@ -42,9 +42,18 @@ class Link(NamedTuple):
 
     def on(self, n: int) -> Link:
         """The same effect, which has no memory and one row of values, over `n` rows."""
-        return self._replace(
-            values=np.broadcast_to(self.values, (n, self.values.shape[1])), memory=np.empty((n, 0))
-        )
+        return self.over(np.zeros(n, np.int64))
+
+    def over(self, which: Ints) -> Link:
+        """The same effect, which has no memory, over rows (n,) that have these of its rows of values; the one
+        row, where it has no more."""
+        values = self.values[which if len(self.values) > 1 else np.zeros_like(which)]
+        return self._replace(values=values, memory=np.empty((len(which), 0)))
+
+    def alone(self, k: int) -> Link:
+        """The same effect with one of its rows of values and its memory."""
+        own = slice(k, k + 1) if len(self.values) > 1 else slice(None)
+        return self._replace(values=self.values[own], memory=self.memory[own])
 
 
 def at_rest(what: Effect, n: int, routing: Routing) -> Floats:
@@ -116,7 +125,8 @@ def act(links: Iterable[Link], opened: EffectPorts, state: Any = None, dt: float
 def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> None:
     """Let an effect with a memory change the tendon lengths of `opened`, whose rows are the samples of
     `runs`, each from rest; `dt` (n,) is the time before each sample [s]."""
-    rest, out, dl = opened.rest_length, np.empty_like(opened.tendon_length), opened.dl
+    rest, dl = opened.rest_length, opened.dl
+    out = dl.copy()
     for span in runs:
         memory = one.memory.copy()
         if hasattr(one.effect, "sweep"):
@@ -168,9 +178,9 @@ def relaxed(fraction: Floats, off: Floats, before: Floats, least: Floats) -> Flo
 
 def stay_back(one: Link, bend: Floats, runs: Sequence[slice]) -> Floats:
     """(n, n_segments, 2) the bend that an effect with a memory of the body holds back [rad], at samples of
-    `runs`, each from rest, whose solved bend (n, n_segments, 2) is known."""
+    `runs`, each from rest, whose solved bend (n, n_segments, 2) is known; 0 at others."""
     assert isinstance(one.effect, BodyOperator)
-    out = np.empty_like(bend)
+    out = np.zeros_like(bend)
     for span in runs:
         out[span] = one.effect.sweep(one.values, one.memory.copy(), bend[None, span])[0]
     return out

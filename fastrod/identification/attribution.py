@@ -25,6 +25,7 @@ from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
 from fastrod.identification.search.motion import HORIZONS, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
+from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
 from fastrod.logs.runlog import RunLog
@@ -63,6 +64,7 @@ def identify(
     exclude: Sequence[str] = (),
     network: bool = False,
     dynamics: bool = False,
+    only_session: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
     threads: int | None = None,
 ) -> Result:
@@ -75,6 +77,9 @@ def identify(
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
     `dynamics` replays the log in motion, with inertia and damping, and fits the robot's own parameters alone:
     no effect is tried, the camera's place is not registered, and `free_camera` frees its priors only.
+    Zeros of the drives, registration and delay are of a session, where the log names several, and all else is
+    shared. With `only_session` they alone are fitted: a robot that was identified before, on another day; no
+    effect is tried.
     Deterministic, unless the search stops by time (`MOST_SECONDS`), as a note then says.
     Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
@@ -82,6 +87,9 @@ def identify(
         raise InputError(f"max_effects is {max_effects!r}; it must be a whole number, 0 or more.")
     if network and dynamics:
         raise InputError("network=True is for a log at rest; leave it out with dynamics=True.")
+    if only_session and dynamics:
+        raise InputError("only_session=True is for a log at rest; leave it out with dynamics=True.")
+    max_effects = 0 if only_session else max_effects
     if network:
         check_network()
     progressed, most = progress or (lambda *_: None), max_effects + _SPARE + 2
@@ -99,7 +107,13 @@ def identify(
 
     def model_of(robot: Robot) -> Model:
         seen = robot if reading.registration is None else reading.registration.on(robot)
-        return base_model(seen, free_camera=free_camera, registered=moved)
+        return base_model(
+            seen,
+            free_camera=free_camera,
+            registered=moved,
+            sessions=log.samples.sessions,
+            only_session=only_session,
+        )
 
     progressed("base fit", 0, most)
     base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads)
@@ -120,8 +134,10 @@ def identify(
     )
     explained = explain(log, base, outcome)
     base = replace(base, noise=base.noise.below(explained.train_error.after))
+    again = visits(log.samples, explained.start.model, explained.start.theta)
+    remaining = remaining.with_memory(again.compare(explained.after))
     grounds = verdict_on(base, outcome, explained, remaining)
-    result = assemble(log, base, outcome, explained, remaining, grounds)
+    result = assemble(log, base, outcome, explained, remaining, grounds, again)
     # what was asked of a robot with other tendons is answered
     questions = reading.questions if base.without is None else filter(None, [time_question(some)])
     result = replace(result, notes=[*questions, *result.notes])

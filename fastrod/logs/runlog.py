@@ -53,6 +53,12 @@ class RunLog:
     pulled."""
     tip_position: Floats
     """(n, 3) measured tip, base frame [m]."""
+    pos: Floats | None = None
+    """(n, n_tendons) measured positions of the drives, counted as `dl` [m]: what moved the tendons, where
+    `dl` was asked for."""
+    session: NDArray[np.str_] | None = None
+    """(n,) label of the session of each sample: zeros, registration and latency are of a session, all else is
+    of the robot."""
     ext: Floats | None = None
     """(n, n_segments) change of each segment's backbone length [m]."""
     tip_quaternion: Floats | None = None
@@ -74,6 +80,8 @@ class RunLog:
             "t": (n,),
             "run": (n,),
             "dl": (n, None),
+            "pos": self.dl.shape,
+            "session": (n,),
             "tip_position": (n, 3),
             "ext": (n, None),
             "tip_quaternion": (n, 4),
@@ -85,7 +93,7 @@ class RunLog:
         for name, shape in shapes.items():
             if (value := getattr(self, name)) is None:
                 continue
-            array = np.array(value, dtype=np.str_ if name == "run" else np.float64)
+            array = np.array(value, dtype=np.str_ if name in ("run", "session") else np.float64)
             if array.ndim != len(shape) or any(
                 want not in (None, got) for want, got in zip(shape, array.shape, strict=True)
             ):
@@ -170,23 +178,23 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
     t, tip = group(("t",)), group(_TIP)
     assert t is not None
     assert tip is not None
-    names, by_drive = _dl_columns(table, robot, where)
-    dl = group(names)
-    dl = dl if dl is None or by_drive is None else dl @ by_drive
+    dl, pos = (_of_tendons(table, kind, robot, where, group) for kind in ("dl", "pos"))
     payload = group(("payload",))
     log = RunLog(
         name=path.stem,
         t=t[:, 0],
-        run=_labels(table, n),
+        run=_labels(table, n, "run"),
         dl=np.zeros((n, 0)) if dl is None else dl,
         tip_position=tip,
+        pos=pos,
+        session=_labels(table, n, "session") if "session" in table else None,
         ext=_extension(table, robot, where, known),
         tip_quaternion=_unit(group(_TIP_QUATERNION), _TIP_QUATERNION, where),
         points=_points(table, robot, where, group),
         tip_force=group(_TIP_FORCE),
         payload=None if payload is None else payload[:, 0],
         base_quaternion=_unit(group(_BASE_QUATERNION), _BASE_QUATERNION, where),
-        extra={name: cells for name, cells in table.items() if name not in known | {"run"}},
+        extra={name: cells for name, cells in table.items() if name not in known | {"run", "session"}},
     )
     _check_time(log, where)
     _check_units(log, robot, where)
@@ -393,24 +401,35 @@ def _nearest_column(name: str, table: Table) -> str:
     )
 
 
-def _dl_columns(table: Table, robot: Robot, where: str) -> tuple[list[str], Floats | None]:
-    """dl_1 ... dl_n of the robot, after a check that the log has these and no others. Of tendons that can
-    only pull, two on a drive, the log may have one column for each drive: then also (n_drives, n_tendons)
-    what a drive makes of its tendons."""
-    names = [f"dl_{k}" for k in range(1, robot.n_tendons + 1)]
-    given = [name for name in table if re.fullmatch(r"dl_\d+", name)]
+def _of_tendons(
+    table: Table, kind: str, robot: Robot, where: str, group: Callable[[Sequence[str]], Floats | None]
+) -> Floats | None:
+    """(n, n_tendons) the columns of each tendon of a `kind`, "dl", which a log must have, or "pos"."""
+    if kind != "dl" and not any(re.fullmatch(rf"{kind}_\d+", name) for name in table):
+        return None
+    names, by_drive = _tendon_columns(table, kind, robot, where)
+    values = group(names)
+    return values if values is None or by_drive is None else values @ by_drive
+
+
+def _tendon_columns(table: Table, kind: str, robot: Robot, where: str) -> tuple[list[str], Floats | None]:
+    """dl_1 ... dl_n of the robot, or another `kind`, after a check that the log has these and no others. Of
+    tendons that can only pull, two on a drive, the log may have one column for each drive: then also
+    (n_drives, n_tendons) what a drive makes of its tendons."""
+    names = [f"{kind}_{k}" for k in range(1, robot.n_tendons + 1)]
+    given = [name for name in table if re.fullmatch(rf"{kind}_\d+", name)]
     wiring = route(robot)
     if len(given) == wiring.n_drives < len(names) and all(t.unilateral for t in robot.tendons):
         by_drive = np.eye(wiring.n_drives)[wiring.drive].T * wiring.drive_sign
-        return [f"dl_{k}" for k in range(1, wiring.n_drives + 1)], by_drive
+        return [f"{kind}_{k}" for k in range(1, wiring.n_drives + 1)], by_drive
     too_many = [name for name in given if name not in names]
     if too_many or (len(given) < len(names) and given):
         twins = [name for name in robot_names() if load_robot(name).n_tendons == len(given)]
         hint = f" Shipped robots with {len(given)}: {', '.join(twins)}." if twins else ""
         raise LogError(
-            f"{where} has {len(given)} dl_ columns ({given[0]} to {given[-1]}); robot {robot.name!r} has "
+            f"{where} has {len(given)} {kind}_ columns ({given[0]} to {given[-1]}); robot {robot.name!r} has "
             f"{robot.n_tendons} tendons "
-            f"and needs {f'dl_1 to dl_{robot.n_tendons}' if names else 'none'}.{hint}"
+            f"and needs {f'{names[0]} to {names[-1]}' if names else 'none'}.{hint}"
         )
     _need(table, names, where, f"that robot {robot.name!r} needs for its {robot.n_tendons} tendons")
     return names, None
@@ -450,10 +469,10 @@ def _points(
     return None if columns is None else columns.reshape(-1, k, 3)
 
 
-def _labels(table: Table, n: int) -> NDArray[np.str_]:
-    cells = table.get("run", [""] * n)
+def _labels(table: Table, n: int, name: str) -> NDArray[np.str_]:
+    cells = table.get(name, [""] * n)
     if isinstance(cells, np.ndarray):
-        cells = [f"{cell:g}" for cell in cells]  # runs that a Parquet file numbers
+        cells = [f"{cell:g}" for cell in cells]  # labels that a Parquet file numbers
     return np.array([str(cell).strip() for cell in cells])
 
 
@@ -527,9 +546,11 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
             far,
         )
     _check_changes(log, robot, where)
-    for k in range(log.dl.shape[1]):
-        long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"
-        refuse(np.abs(log.dl[:, k]) > length, f"column dl_{k + 1}", log.dl[:, k], "m", long)
+    for kind, values in (("dl", log.dl), ("pos", log.pos)):
+        for k in range(log.dl.shape[1] if values is not None else 0):
+            assert values is not None
+            long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"
+            refuse(np.abs(values[:, k]) > length, f"column {kind}_{k + 1}", values[:, k], "m", long)
     for k in range(0 if log.ext is None else log.ext.shape[1]):
         assert log.ext is not None
         low, high = robot.segments[k].extension
@@ -577,10 +598,13 @@ def _columns(log: RunLog) -> Table:
     columns: Table = {"t": log.t}
     if log.runs != [""]:
         columns["run"] = log.run.tolist()
+    if log.session is not None:
+        columns["session"] = log.session.tolist()
     points = np.zeros((len(log), 0, 3)) if log.points is None else log.points
     point_names = [f"p{k}_{axis}" for k in range(1, points.shape[1] + 1) for axis in "xyz"]
     groups: list[tuple[Sequence[str], Floats | None]] = [
         ([f"dl_{k}" for k in range(1, log.dl.shape[1] + 1)], log.dl),
+        ([f"pos_{k}" for k in range(1, log.dl.shape[1] + 1)], log.pos),
         ([f"ext_{k}" for k in range(1, 1 + (0 if log.ext is None else log.ext.shape[1]))], log.ext),
         (_TIP, log.tip_position),
         (_TIP_QUATERNION, log.tip_quaternion),

@@ -9,6 +9,7 @@ therefore the error before any identification.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -30,6 +31,11 @@ ASL_MOTORS = ((3, 5), (1, 6), (2, 4))
 """Motors whose tendons end at disk 1, 2, 3, published."""
 ASL_DIRECTION = {1: -45.0, 2: -105.0, 3: 195.0, 4: 165.0, 5: 105.0, 6: 45.0}
 """Pull direction of each motor in the mocap x-z plane, from x toward z [deg], published."""
+ASL_BASE = (0.1034, 0.1082)
+"""Base [m], mocap x and z, where a run begins in motion: the mean of the disk centres where perlin_0g begins,
+nominal."""
+_ASL_NEAR_REST = 4.0
+"""Of a motor [deg]: the pose of a run that begins so near to rest is that of rest."""
 ASL_SPOOL_RADIUS = 0.03
 """Nominal [m]. Without loads the shape knows only its ratio to the pitch radius; here that ratio is 1."""
 ASL_PITCH_RADIUS = 0.03
@@ -74,17 +80,18 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
 
     Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down), at the height y = 0 of the mocap
     frame. The base point is not published: in each run it lies over the mean of the three disk centres in the
-    run's first row, where the motors are within 4 deg of rest (rest pose and motor zeros change between
-    sessions).
+    run's first row, where the motors are within 4 deg of rest there, else at `ASL_BASE`. Rest pose and motor
+    zeros change between sessions: the perlin runs with payloads are one, those that begin at one pose to
+    0.01 mm, of June, are another, every other recording is its own.
 
     Published: disk heights, which motor ends where, pull directions, payload. A motor pulls one tendon and
     pays out its antagonist, and both can only pull: twelve tendons, in the order of motors 3 5 | 1 6 | 2 4,
     the one that the motor pulls first. `dl` = -spool radius times the *commanded* motor angle u, for that is
-    what a user has beforehand, and its negative for the antagonist; `extra` keeps the measured angles phi (up
-    to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2. Nominal: spool radius, pitch radius, tendon
-    compliance and pretension, axial stiffness, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a
-    corrugated hose bends but hardly twists), a weightless body. Only `payload` loads the rod, and how far it
-    sags rests on the nominal stiffness.
+    what a user has beforehand, and its negative for the antagonist; `pos` is the same of the measured angles
+    phi (up to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2. Nominal: spool radius, pitch
+    radius, tendon compliance and pretension, axial stiffness, bending stiffness 0.05, torsional stiffness 0.5
+    N m^2 (a corrugated hose bends but hardly twists), a weightless body. Only `payload` loads the rod, and
+    how far it sags rests on the nominal stiffness.
     """
     table, where = _table(path, "asl_trunk"), Path(path).name
     disks = [
@@ -93,28 +100,36 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
     labels = np.array(table["run"])
     for label in dict.fromkeys(labels.tolist()):
         rows = labels == label
+        begun = max(abs(numbers(table, f"u{k}_deg", where)[rows][0]) for k in range(1, 7))
         base = np.mean([disk[rows][0] for disk in disks], axis=0) * (1.0, 1.0, 0.0)
+        base = base if begun < _ASL_NEAR_REST else np.array([*ASL_BASE, 0.0])
         for disk in disks:
             disk[rows] -= base
-    order = [motor for pair in ASL_MOTORS for motor in pair]
+
+    def by_tendon(angle: str) -> NDArray[np.float64]:
+        order = [motor for pair in ASL_MOTORS for motor in pair]
+        rad = [np.radians(numbers(table, f"{angle}{motor}_deg", where)) for motor in order]
+        return np.stack([sign * ASL_SPOOL_RADIUS * each for each in rad for sign in (-1.0, 1.0)], axis=1)
+
+    pos = by_tendon("phi")
     log = RunLog(
         name=Path(path).stem,
         t=numbers(table, "t_s", where),
         run=labels,
-        dl=np.stack(
-            [
-                sign * ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where))
-                for motor in order
-                for sign in (-1.0, 1.0)
-            ],
-            axis=1,
-        ),
+        dl=by_tendon("u"),
         tip_position=disks[2],
+        pos=pos if np.isfinite(pos).any() else None,
+        session=np.array([_asl_session(label) for label in labels.tolist()]),
         points=np.stack(disks[:2], axis=1),
         payload=numbers(table, "payload_g", where) / 1000.0,
-        extra={f"phi{k}_deg": numbers(table, f"phi{k}_deg", where) for k in range(1, 7)},
     )
     return log if run is None else log.only(run), _asl_robot()
+
+
+def _asl_session(run: str) -> str:
+    if re.fullmatch(r"perlin_\d+g", run):
+        return "perlin"
+    return "june" if run.startswith(("strokes", "hops_june")) else re.sub(r"_[a-z]$", "", run)
 
 
 def _asl_robot() -> Robot:

@@ -63,8 +63,11 @@ def test_asl_trunk_units_frame_and_order(tmp_path: Path) -> None:
     # commanded; motors 3 5 | 1 6 | 2 4
     assert_allclose(np.degrees(-log.dl[1, ::2] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])
     assert_array_equal(log.dl[:, 1::2], -log.dl[:, ::2])  # the antagonist is paid out
-    assert sorted(log.extra) == [f"phi{k}_deg" for k in range(1, 7)]
-    assert_allclose([log.extra[f"phi{k}_deg"][1] for k in range(1, 7)], [10, 20, 30, 40, 50, 60])  # measured
+    assert log.pos is not None
+    order = [motor for pair in measured.ASL_MOTORS for motor in pair]
+    felt = np.radians([10.0 * motor for motor in order])  # measured, the antagonist the other way
+    assert_allclose(log.pos[1, ::2], -measured.ASL_SPOOL_RADIUS * felt)
+    assert_allclose(log.pos[1, 1::2], measured.ASL_SPOOL_RADIUS * felt)
     assert log.payload is not None
     assert_allclose(log.payload, 0.1)
     assert robot.length == pytest.approx(0.320)
@@ -201,9 +204,9 @@ def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     """Why it matters whether `dl` is commanded or measured: on the wandering run they are 11.5 deg apart
     (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
-    order = [motor for pair in measured.ASL_MOTORS for motor in pair]
-    reported = np.degrees(-log.dl[:, ::2] / measured.ASL_SPOOL_RADIUS)
-    felt = np.stack([log.extra[f"phi{motor}_deg"] for motor in order], axis=1)
+    reported, felt = (
+        np.degrees(-each[:, ::2] / measured.ASL_SPOOL_RADIUS) for each in (log.dl, np.asarray(log.pos))
+    )
     assert np.sqrt(np.mean((felt - reported) ** 2)) == pytest.approx(11.5, abs=0.1)
     late = [np.sqrt(np.mean((felt[k:] - reported[: len(reported) - k]) ** 2)) for k in range(12)]
     assert int(np.argmin(late)) > 0

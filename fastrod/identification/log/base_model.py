@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fastrod.effects.base import columns, effect_names, get_effect
+from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import RobotError, nearest
 from fastrod.identification.log.unknowns import ADDED, SEGMENT_UNITS, TENDON_UNITS, Model, Unknown, nominal_of
@@ -29,21 +30,30 @@ _POSITIVE = (
 )
 STIFFNESS_SD = 0.3
 """Relative prior of EI and GJ where the robot file says nothing."""
-FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
+FREE_CAMERA: dict[str, Any] = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
 """Priors of a camera that nobody calibrated: m and rad, m, s."""
+_ZERO_SD = 0.1
+"""Prior of a drive's zero in another session, where `[fit]` says nothing: rad, as a bend of its segment."""
 ROUGH = (0.1, 0.2)
 """Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm
 off."""
 
 
 def base_model(
-    robot: Robot, *, free_camera: bool = False, registered: bool = False, dynamics: bool = False
+    robot: Robot,
+    *,
+    free_camera: bool = False,
+    registered: bool = False,
+    dynamics: bool = False,
+    sessions: Sequence[str] = ("",),
+    only_session: bool = False,
 ) -> Model:
-    """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
+    """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness; and of each
+    of its `sessions` but the first, its own zeros, registration and delay.
 
     `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. `dynamics`:
-    it is fitted in motion. Raises `RobotError` for a target that is none, naming the nearest, and for one
-    that only motion shows without it.
+    it is fitted in motion. With `only_session` all is known but what is of a session. Raises `RobotError` for
+    a target that is none, naming the nearest, and for one that only motion shows without it.
     """
     wiring = route(robot)
     unknowns: list[Unknown] = []
@@ -78,8 +88,21 @@ def base_model(
             sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1])
         )
     unknowns += _camera(sensor, robot, wiring)
+    if only_session:
+        unknowns = _of_session(robot, wiring, sensor)
+    for k, label in enumerate(sessions[1:], 1):
+        unknowns += [
+            replace(u, name=f"session {label or k + 1}.{u.name}", session=k)
+            for u in _of_session(robot, wiring, sensor)
+        ]
     effects += [u.place[1] for u in unknowns if u.place[0] == "effect"]
-    return Model(robot, wiring, tuple(name for name in effect_names() if name in effects), tuple(unknowns))
+    return Model(
+        robot,
+        wiring,
+        tuple(name for name in effect_names() if name in effects),
+        tuple(unknowns),
+        tuple(sessions),
+    )
 
 
 def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, float]) -> list[Unknown]:
@@ -102,7 +125,7 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
     sd = _checked_sd(robot, target, prior)
     which = list(range(count)) if number == "*" else [int(number) - 1]
     if kind in ("gain", "zero"):
-        return _drive_unknowns(wiring, kind, which, sd, bool(prior.get("shared")), target)
+        return _drive_unknowns(robot, wiring, kind, which, sd, bool(prior.get("shared")), target)
     nominal = [nominal_of(robot, kind, k) for k in which]
     if not all(map(math.isfinite, nominal)):
         raise RobotError(
@@ -150,6 +173,22 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
     return made
 
 
+def _of_session(robot: Robot, wiring: Routing, sensor: Mapping[str, Any]) -> list[Unknown]:
+    """What another session has of its own: zeros of the drives, registration and delay, about what the robot
+    file says."""
+    zero = float(
+        robot.fit.get("tendon.*.zero", {}).get("sd", _ZERO_SD * float(np.mean(wiring.tendon_offset)))
+    )
+    shift, angle = _wider(sensor.get("registration_sd", 0.0), FREE_CAMERA["registration_sd"])
+    delay = max(float(sensor.get("latency_sd", 0.0)), FREE_CAMERA["latency_sd"])
+    every = list(range(robot.n_tendons))
+    zeros = _drive_unknowns(robot, wiring, "zero", every, zero, False, "tendon.*.zero") if every else []
+    return [
+        *zeros,
+        *_camera({"registration_sd": (shift, angle), "latency_sd": delay if every else 0.0}, robot, wiring),
+    ]
+
+
 def _checked_sd(robot: Robot, target: str, prior: Mapping[str, float]) -> float:
     unknown = [key for key in prior if key not in ("sd", "shared")]
     if unknown or "sd" not in prior:
@@ -180,26 +219,29 @@ def _lump_unknown(robot: Robot, target: str, place: tuple[int, int], sd: float) 
 
 
 def _drive_unknowns(
-    wiring: Routing, kind: str, which: list[int], sd: float, shared: bool, target: str
+    robot: Robot, wiring: Routing, kind: str, which: list[int], sd: float, shared: bool, target: str
 ) -> list[Unknown]:
-    """Gains and zeros of tendons are those of their drives: no bend tells antagonists of one drive apart."""
+    """Gains and zeros of tendons are those of their drives, about those that the effects of the robot file
+    have: no bend tells antagonists of one drive apart."""
     name = "drum_gain" if kind == "gain" else "encoder_offset"
     unit = TENDON_UNITS[kind]
     drives = list(dict.fromkeys(int(wiring.drive[t]) for t in which))
     groups = [tuple(drives)] if shared else [(d,) for d in drives]
-    low = max(-0.95, -10.0 * sd) if kind == "gain" else -10.0 * sd
+    known = read_values(name, named_effects(robot).get(name, {}), wiring, f"robot {robot.name!r}")
+    least = -0.95 if kind == "gain" else -math.inf
+    about = [(group, float(np.mean(known[list(group)]))) for group in groups]
     return [
         Unknown(
             target if shared else f"tendon.{int(np.flatnonzero(wiring.drive == group[0])[0]) + 1}.{kind}",
             unit,
-            0.0,
-            0.0,
+            mean,
+            mean,
             sd,
-            (low, 10.0 * sd),
+            (max(least, mean - 10.0 * sd), mean + 10.0 * sd),
             0.1 * sd,
             ("effect", name, *map(str, group)),
         )
-        for group in groups
+        for group, mean in about
     ]
 
 

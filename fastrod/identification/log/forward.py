@@ -36,6 +36,7 @@ from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
 from fastrod.identification.log.unknowns import Model
+from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
@@ -88,6 +89,10 @@ class LogSamples:
     """(n,) since the start of its run [s]."""
     dt: Floats
     """(n,) since the sample before; 0 at the start of a run, unless it continues the run before [s]."""
+    session: Ints
+    """(n,) number of each sample's session."""
+    sessions: tuple[str, ...]
+    """Their labels, that of most samples first; ("",) of a log without."""
 
     @property
     def histories(self) -> tuple[slice, ...]:
@@ -95,13 +100,19 @@ class LogSamples:
         starts = [span.start for span in self.runs if not self.dt[span.start]]
         return tuple(slice(*ends) for ends in pairwise([*starts, len(self.dt)]))
 
+    def histories_of(self, session: int) -> list[slice]:
+        """Those of one session, by its number."""
+        return [span for span in self.histories if self.session[span.start] == session]
+
     def on(self, rows: Ints) -> LogSamples:
         """The same samples, compared at other rows."""
         return replace(self, rows=rows)
 
 
 def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
-    """The samples of a log; runs that are interleaved are put one after the other."""
+    """The samples of a log, moved by its drives where these were measured; runs that are interleaved are put
+    one after the other."""
+    log = moved(log)
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
     ordered = log.rows(order)
@@ -110,6 +121,7 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
     time, dt = np.empty(len(ordered)), np.zeros(len(ordered))
     t, dl = ordered.t, ordered.dl
+    session = np.full(len(ordered), "") if ordered.session is None else ordered.session
     largest = max((np.abs(np.diff(dl[span], axis=0)).max(initial=0.0) for span in runs), default=0.0)
     for span in runs:
         first = span.start
@@ -117,10 +129,22 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
         dt[first + 1 : span.stop] = np.diff(t[span])
         # a run goes on where the one before ends: soon after it, and the commands do not jump
         jump = np.abs(dl[first] - dl[first - 1]).max(initial=0.0)
-        if first and 0.0 < t[first] - t[first - 1] <= _SOON and jump <= largest:
+        same = bool(first) and session[first] == session[first - 1]
+        if same and 0.0 < t[first] - t[first - 1] <= _SOON and jump <= largest:
             dt[first] = t[first] - t[first - 1]
     measured = np.flatnonzero(ordered.measured) if rows is None else rows
-    return LogSamples(ordered, order, measured, runs, time, dt)
+    labels, number, count = np.unique(session, return_inverse=True, return_counts=True)
+    largest_first = np.argsort(-count, kind="stable")
+    return LogSamples(
+        ordered,
+        order,
+        measured,
+        runs,
+        time,
+        dt,
+        np.argsort(largest_first)[number],
+        tuple(labels[largest_first].tolist()),
+    )
 
 
 class RodAnswer(NamedTuple):
@@ -274,6 +298,7 @@ class PreparedLog:
         """Ports of the rows after the effects of `links`, less sensing and those that feel the tip. Up to the
         last one with a memory they run over every sample, for the tendons' lengths."""
         opened, rest, dl = self.open(), self.robot.rest_tendon_length, self.dl
+        at_rows = self.samples.session[self.samples.rows]
         swept = 1 + max((i for i, each in enumerate(links) if _of_tendons(each)), default=-1)
         if swept:
             alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
@@ -282,20 +307,27 @@ class PreparedLog:
                 every.solved_tension = self.tension
             for each in links[:swept]:
                 if has_memory(each.effect):
-                    sweep(each, every, self.samples.histories, self.samples.dt)
+                    for k in range(len(each.values)):
+                        sweep(each.alone(k), every, self._histories(each, k), self.samples.dt)
                 else:
-                    act([each.on(len(every))], every)
-                    act([each.on(len(opened))], opened)  # for what it changes beside the tendons' lengths
+                    act([each.over(self.samples.session)], every)
+                    act([each.over(at_rows)], opened)  # for what it changes beside the tendons' lengths
             dl = every.dl
             opened.tendon_length = dl[self.samples.rows] + rest
         bend = self.wiring.bend(dl) if self.beyond is None else self.wiring.bend(dl) + self.beyond
         opened.solved_bend = bend[self.samples.rows]
         for each in links[swept:]:
             if isinstance(each.effect, BodyOperator):
-                opened.rest_bend += stay_back(each, bend, self.samples.histories)[self.samples.rows]
+                for k in range(len(each.values)):
+                    held = stay_back(each.alone(k), bend, self._histories(each, k))
+                    opened.rest_bend += held[self.samples.rows]
             else:
-                act([each.on(len(opened))], opened)
+                act([each.over(at_rows)], opened)
         return opened
+
+    def _histories(self, one: Link, k: int) -> Sequence[slice]:
+        """Those over which the `k`-th row of an effect's values holds."""
+        return self.samples.histories_of(k) if len(one.values) > 1 else self.samples.histories
 
     def solve(
         self, links: Sequence[Link], rod: PredictedRod, robot: Robot, rough: bool = False
@@ -329,7 +361,9 @@ class PreparedLog:
         """Ports of the rows after the effects of `links`, those that feel the tip included, and the pose of
         `robot` at these, with what else the rod answers. A row at which such a force and the rod find no
         balance is not `ok`."""
-        felt = [each.on(len(self.samples.rows)) for each in links if feels_tip(each.effect)]
+        felt = [
+            each.over(self.samples.session[self.samples.rows]) for each in links if feels_tip(each.effect)
+        ]
         opened = self.drive(links)
         pose = rod.solve(*self.kernel(opened), robot)
         answer = rod.answer
@@ -372,7 +406,8 @@ class PreparedLog:
 
     def see(self, pose: PredictedPose, links: Sequence[Link]) -> PredictedPose:
         """The pose as the camera sees it, by the effects of sensing in `links`."""
-        sensing = [each.on(len(pose.ok)) for each in links if each.effect.seam is Seam.SENSING]
+        at_rows = self.samples.session[self.samples.rows]
+        sensing = [each.over(at_rows) for each in links if each.effect.seam is Seam.SENSING]
         if not sensing:
             return pose
         return PredictedPose(*sense(sensing, self.open(), SensedPoses(*pose[:3])), pose.ok)
@@ -409,12 +444,13 @@ def _of_tendons(one: Link) -> bool:
 
 
 def effects_at(model: Model, theta: Floats) -> list[Link]:
-    """The effects of a model at `theta`, one row of values each, in the order in which they act.
+    """The effects of a model at `theta`, one row of values each, or one for each session, in the order in
+    which they act.
 
     Raises `InputError` for a memory of other things than tendons and bends: only those are carried over a
     log.
     """
-    links = [link(name, values[None], model.wiring) for name, values in model.values(theta).items()]
+    links = [link(name, values, model.wiring) for name, values in model.by_session(theta).items()]
     for each in links:
         if has_memory(each.effect) and not (_of_tendons(each) or reads_bend(each.effect)):
             raise InputError(

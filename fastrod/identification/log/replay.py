@@ -11,6 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError, LogError
 from fastrod.identification.log.inputs import base_of, inputs
+from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.threads import one_blas_thread
@@ -143,7 +144,7 @@ def replay(
             from fastrod.identification.log.questions import questions
 
             open_questions = questions(log, robot)
-        tip, points, converged = _at_rest(log, robot, n_points, simulator, progress)
+        tip, points, converged = _at_rest(moved(log), robot, n_points, simulator, progress)
     tip[~converged], points[~converged] = np.nan, np.nan
     return Replay(
         log=log,

@@ -11,6 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError, LogError, UnknownNameError, nearest
 from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.logs.drives import sentences
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Ints
@@ -31,12 +32,21 @@ class SplitLog:
     """(n,) samples that no fit sees."""
     labels: Sequence[str]
     """What these are, in words."""
+    drives: Sequence[str] = ()
+    """What its drives did of their commands, where they were measured, in sentences."""
 
 
 def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> SplitLog:
     """The samples of `logs` of `robot`; `held_out` as for `held_out_rows`. Raises `LogError` where they
     cannot tell anything, `InputError` for a robot that is driven by tensions."""
     log = merged(logs)
+    for label in log.runs if log.session is not None else []:
+        named = np.unique(np.asarray(log.session)[log.run == label]).tolist()
+        if len(named) > 1:
+            raise LogError(
+                f"run {label!r} of log {log.name!r} is of sessions {named[0]!r} and {named[1]!r}; a run is "
+                "of one session."
+            )
     if not log.driven.any():
         raise LogError(
             f"log {log.name!r} has no row in which every input is there; there is nothing to "
@@ -51,7 +61,8 @@ def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> Spli
             f"log {log.name!r} leaves {len(rows)} rows to fit once {', '.join(labels)} are held "
             f"out; it needs {_LEAST_ROWS}."
         )
-    return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels)
+    drives = () if log.pos is None else sentences(log)
+    return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels, drives=drives)
 
 
 def thinned(rows: Ints, most: int) -> Ints:
@@ -76,8 +87,16 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
     if len({log.points.shape[1] for log in logs if log.points is not None}) > 1:
         raise LogError("the logs have different numbers of points; they must be of one robot.")
-    optional = ("ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
     columns: dict[str, Any] = {}
+    if any(log.session is not None for log in logs):
+        columns["session"] = np.concatenate(
+            [np.full(len(log), log.name) if log.session is None else log.session for log in logs]
+        )
+    if any(log.pos is not None for log in logs):
+        columns["pos"] = np.concatenate(
+            [np.full(log.dl.shape, np.nan) if log.pos is None else log.pos for log in logs]
+        )
+    optional = ("ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
     for name in optional:
         pieces = [getattr(log, name) for log in logs]
         have = [span is not None for span in pieces]

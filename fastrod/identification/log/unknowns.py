@@ -62,6 +62,8 @@ class Unknown:
     """Fitted as a logarithm."""
     shape: bool = False
     """Shapes an effect, and has no size of its own."""
+    session: int = 0
+    """Number of the session that it is of alone; 0: of the robot, and of the first session."""
 
     def inside(self, theta: float) -> float:
         """The value of a fitted number."""
@@ -87,6 +89,8 @@ class Model:
     effects: tuple[str, ...]
     """Names, in the order in which they act."""
     unknowns: tuple[Unknown, ...]
+    sessions: tuple[str, ...] = ("",)
+    """Labels of the sessions: what is of one of them alone holds there in place of what is of the robot."""
 
     @property
     def start(self) -> Floats:
@@ -134,15 +138,25 @@ class Model:
                     return int(number) - 1
         return None
 
-    def values(self, theta: Floats) -> dict[str, Floats]:
-        """Effect name -> (n_columns,) values at the fitted numbers `theta` (p,); what is not unknown, as the
-        robot has it or neutral."""
+    def values(self, theta: Floats, session: int = 0) -> dict[str, Floats]:
+        """Effect name -> (n_columns,) values in a session at the fitted numbers `theta` (p,); what is not
+        unknown, as the robot has it or neutral."""
         known = named_effects(self.robot)
         values = {name: read_values(name, known.get(name, {}), self.wiring, "robot") for name in self.effects}
-        for unknown, number in zip(self.unknowns, theta, strict=True):
-            if unknown.place[0] == "effect":
+        # what is of the robot comes first, and what is of the session in its place
+        for unknown, number in sorted(zip(self.unknowns, theta, strict=True), key=lambda u: u[0].session):
+            if unknown.place[0] == "effect" and unknown.session in (0, session):
                 values[unknown.place[1]][[int(c) for c in unknown.place[2:]]] = unknown.inside(float(number))
         return values
+
+    def by_session(self, theta: Floats) -> dict[str, Floats]:
+        """Effect name -> (1, n_columns) values, or (n_sessions, n_columns) where a session has its own."""
+        own = {u.place[1] for u in self.unknowns if u.session}
+        every = [self.values(theta, k) for k in range(len(self.sessions) if own else 1)]
+        return {
+            name: np.stack([values[name] for values in (every if name in own else every[:1])])
+            for name in self.effects
+        }
 
     def robot_at(self, theta: Floats) -> Robot:
         """The robot with the fitted numbers `theta` (p,), without its effects."""
@@ -152,11 +166,11 @@ class Model:
                 robot = _changed(robot, self.robot, unknown, unknown.inside(float(number)))
         return _whole(robot, self.robot)
 
-    def identified(self, theta: Floats) -> Robot:
-        """The robot with its effects as tables; `[fit]` and `[sensor]` are left out, for what they asked for
-        is in it now."""
+    def identified(self, theta: Floats, session: int = 0) -> Robot:
+        """The robot with its effects in a session as tables; `[fit]` and `[sensor]` are left out, for what
+        they asked for is in it now."""
         tables = []
-        for name, values in self.values(theta).items():
+        for name, values in self.values(theta, session).items():
             table: dict[str, Any] = {"name": name}
             at = 0
             for parameter in get_effect(name).parameters:

@@ -13,6 +13,7 @@ from fastrod.effects.base import get_effect, has_memory
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.noise import keep
+from fastrod.identification.log.registration import between, frame_of
 from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, known_model, nominal_of
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
@@ -22,6 +23,7 @@ from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import BIC_STRONG, ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.revisits import Visits
 from fastrod.identification.search.search import Search, SearchOutcome
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
@@ -47,6 +49,7 @@ _SAY_LIMITS = 0.05
 _SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
 _WORTH_SAYING = 0.03
 _NUMBERS_OF_TENDONS = {"compliance", "pretension", "axial_stiffness"}
+_RETURNS = 2.8  # of the noise: a command that comes back farther off does so by more than the noise
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
@@ -156,8 +159,9 @@ def assemble(
     explained: Explained,
     remaining: ResidualStructure,
     grounds: VerdictGrounds,
+    again: Visits,
 ) -> Result:
-    """All that the report says."""
+    """All that the report says; `again` are the visits of one command at two times."""
     samples, robot, noise, steps = log.samples, base.robot, base.noise, outcome.steps
     kept = [] if grounds.drop_effects else [*explained.names]
     final = explained.state if kept else explained.start
@@ -194,10 +198,14 @@ def assemble(
     ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
     say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
     strain = strained(base_estimates)
+    other_sessions = dict(enumerate(final.model.sessions[1:], 1))
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
     said += _sign_of(base.without) if base.without else []
     said += _stand_ins(kept, final)
     said += _sentences(limits(robot, samples)) if say_limits else []
+    revisits = [again.compare(tip) for tip in (before, after)]
+    if revisits[1] and revisits[1].elsewhere > _RETURNS * noise.floor:
+        said += _sentences([revisits[1].sentence()])
     return Result(
         log=samples.log,
         robot=robot,
@@ -225,9 +233,17 @@ def assemble(
         path=path,
         bounds=explained.search.bounds(final),
         advice=advice.unique([*recommended, *lacks])[:_MOST_ADVICE],
-        notes=[*base.notes, *outcome.notes, *_left_out(explained, test_error)],
+        sessions={label: final.model.identified(final.theta, k) for k, label in other_sessions.items()},
+        notes=[
+            *log.drives,
+            *base.notes,
+            *outcome.notes,
+            *_of_sessions(final),
+            *_left_out(explained, test_error),
+        ],
         solves=base.search.rod.runs,
         as_given_rms=shipped,
+        revisits=(revisits[0], revisits[1]) if revisits[0] and revisits[1] else None,
     )
 
 
@@ -242,6 +258,28 @@ def _stand_ins(names: Sequence[str], state: ModelState) -> list[str]:
             size = f"{plain_name(u.name)} comes out at {amount(value, u.unit)}"
             usual = f"{abs(value) / u.scale:.0f} times what is usual"
             said.append(f"{size}, {usual}: {words(u.place[1])} stands in for something else.")
+    return said
+
+
+def _of_sessions(state: ModelState) -> list[str]:
+    """How far each other session is from the first, in sentences."""
+    model, said, first = state.model, [], frame_of(state.model.identified(state.theta))
+    for k, label in enumerate(model.sessions[1:], 1):
+        here, now = model.identified(state.theta, k), model.values(state.theta, k)
+        camera, was = frame_of(here), model.values(state.theta)
+        off = 1e3 * np.linalg.norm(camera.shift - first.shift)
+        rotated = np.degrees(between(model.identified(state.theta), here).angle)
+        pieces = [
+            f"session {label!r} has its camera {off:.2g} mm and {rotated:.2g} deg from where "
+            f"{model.sessions[0]!r} has it"
+        ]
+        if (name := "encoder_offset") in now:
+            pieces.append(f"zeros up to {1e3 * np.abs(now[name] - was[name]).max():.2g} mm off")
+        if (name := "latency") in now:
+            pieces.append(
+                f"a delay of {1e3 * float(now[name][0]):.0f} ms and not {1e3 * float(was[name][0]):.0f}"
+            )
+        said.append(", ".join(pieces))
     return said
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from fastrod.identification.report.wording import (
     with_error,
     words,
 )
+from fastrod.identification.search.revisits import Revisits
 from fastrod.identification.search.solve import Estimate
 from fastrod.logs.folder import make_folder
 from fastrod.model.robotfile import save_robot
@@ -81,6 +83,7 @@ def to_json(result: Result) -> dict[str, Any]:
             "above_noise": result.above_noise,
             "shares": {key: getattr(structure, key) for key in ("static", "memory", "drift", "exogenous")},
         },
+        "revisits": _revisits(result.revisits),
         "patterns": list(result.patterns),
         "path": [{"name": s.name, "train_rms_m": s.train, "held_out_rms_m": s.held_out} for s in result.path],
         "candidates": [
@@ -118,8 +121,8 @@ def text(result: Result) -> str:
 
 
 def write(result: Result, out_dir: str | Path) -> list[Path]:
-    """Write report.json, report.html and identified.toml into `out_dir`, each whole or not at all; the paths
-    written."""
+    """Write report.json, report.html and identified.toml into `out_dir`, each whole or not at all, and
+    identified_SESSION.toml for each further session; the paths written."""
     out = make_folder(out_dir)
     written = []
     for name, make in (("report.json", text), ("report.html", page)):
@@ -134,8 +137,11 @@ def write(result: Result, out_dir: str | Path) -> list[Path]:
                 partial.unlink()
             raise
         written.append(path)
-    save_robot(result.identified, out / "identified.toml")
-    return [*written, out / "identified.toml"]
+    robots = {"": result.identified, **result.sessions}
+    for label, robot in robots.items():
+        written.append(out / f"identified{re.sub(r'[^A-Za-z0-9.]+', '_', f'_{label}') if label else ''}.toml")
+        save_robot(robot, written[-1])
+    return written
 
 
 def table(result: Result) -> Group:
@@ -225,6 +231,23 @@ def _registration(camera: CameraRegistration | None) -> dict[str, Any] | None:
         "distance_m": camera.distance,
         "rotation": camera.rotation,
         "shift_m": camera.shift,
+    }
+
+
+def _revisits(pair: tuple[Revisits, Revisits] | None) -> dict[str, Any] | None:
+    """The same command at other times; None where too few come again."""
+    if pair is None:
+        return None
+    return {
+        word: {
+            "pairs": seen.n,
+            "elsewhere_rms_m": seen.elsewhere,
+            "floor_without_memory_m": seen.floor,
+            "half_difference_bent_m": seen.bent,
+            "memory": seen.memory,
+            "static": seen.static,
+        }
+        for word, seen in zip(("before", "after"), pair, strict=True)
     }
 
 

@@ -14,6 +14,7 @@ from fastrod.identification.log.registration import CameraRegistration
 from fastrod.identification.report.signature import Signature
 from fastrod.identification.search.model_selection import Bound
 from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.revisits import Revisits
 from fastrod.identification.search.solve import Estimate
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -135,9 +136,13 @@ class Result:
     registration: CameraRegistration | None = None
     """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
     search."""
+    sessions: Mapping[str, Robot] = field(default_factory=dict)
+    """The identified robot in each other session, by its label."""
     as_given_rms: tuple[float, float] | None = None
     """Of the robot as it was given, on fitted and on held-out samples [m]; None where it was not asked
     for."""
+    revisits: tuple[Revisits, Revisits] | None = None
+    """The same command at other times, before and after; None where too few come again."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
 

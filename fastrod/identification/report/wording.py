@@ -119,6 +119,8 @@ def a(noun: str) -> str:
 def plain_name(name: str) -> str:
     """`segment.*.bending_stiffness` as 'bending stiffness, all segments'."""
     owner, _, rest = name.partition(".")
+    if owner.startswith("session ") and rest:
+        return f"{plain_name(rest)}, {owner}"
     number, _, what = rest.partition(".")
     if owner in ("segment", "tendon") and what:
         return f"{words(what)}, {'all ' + owner + 's' if number == '*' else f'{owner} {number}'}"

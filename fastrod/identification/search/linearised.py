@@ -303,7 +303,8 @@ class LinearisedModel:
     def _tip_feedback(self, effects: Sequence[Link], tip: Floats) -> tuple[Floats, Floats]:
         """Tip force of the effects that feel the tip where it is at `tip`, and its slopes (`tip_feedback`);
         zero without such effects."""
-        felt = [each.on(len(tip)) for each in effects if feels_tip(each.effect)]
+        at_rows = self.samples.session[self.samples.rows]
+        felt = [each.over(at_rows) for each in effects if feels_tip(each.effect)]
         if not felt:
             return np.zeros((len(tip), 3)), np.zeros((len(tip), 3, 3))
         return tip_feedback(felt, self.opened, np.where(self.pose.ok[:, None], tip, 0.0))

@@ -9,12 +9,13 @@ signal from outside.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.search.correlation import draws, length
+from fastrod.identification.search.revisits import Revisits
 from fastrod.identification.search.solve import paired
 from fastrod.model.routing import Routing
 from fastrod.types import Floats, Ints
@@ -38,6 +39,13 @@ class ResidualStructure:
     """Autocorrelation that no input, memory or time explains, as a share of the variance."""
     z: float
     """How sure it is that there is any structure, over blocks."""
+
+    def with_memory(self, again: Revisits | None) -> ResidualStructure:
+        """The same, with what visits of one command say is memory: from outside comes the less."""
+        if again is None or not np.isfinite(again.memory):
+            return self
+        more = min(max(again.memory - self.memory, 0.0), self.exogenous)
+        return replace(self, memory=self.memory + more, exogenous=self.exogenous - more)
 
     @property
     def structured(self) -> float:
