@@ -19,11 +19,10 @@ from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
-from fastrod.identification.report.motion import assemble_motion
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
-from fastrod.identification.search.motion import HORIZONS, fit_motion
+from fastrod.identification.search.motion import fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
@@ -75,8 +74,8 @@ def identify(
     With `max_effects` 0 nothing is looked for: the base model is fitted, and that is the result.
     `free_camera` leaves registration, marker offset and latency to the fit. `network` trains a small network
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
-    `dynamics` replays the log in motion, with inertia and damping, and fits the robot's own parameters alone:
-    no effect is tried, the camera's place is not registered, and `free_camera` frees its priors only.
+    `dynamics` replays the log in motion, with inertia and damping; the camera's place is not registered
+    there, and `free_camera` frees its priors only.
     Zeros of the drives, registration and delay are of a session, where the log names several, and all else is
     shared. With `only_session` they alone are fitted: a robot that was identified before, on another day; no
     effect is tried.
@@ -97,7 +96,7 @@ def identify(
     # refuses a wrong [fit] before anything is solved
     model = base_model(robot, free_camera=free_camera, dynamics=dynamics)
     if dynamics:
-        return _in_motion(log, robot, model, progressed, threads)
+        return _in_motion(log, robot, model, frozenset(exclude), max_effects, progressed, threads)
     progressed("registration", 0, most)
     some = log.samples.on(thinned(log.rows, _FEW_ROWS))
     reading = read(some, robot, threads=threads)
@@ -124,20 +123,7 @@ def identify(
 
     log, base, outcome = _found(log, base, reading.guess, max_effects, model_of, progressed, threads)
     progressed("prediction on all samples", most - 1, most)
-    remaining = residual_structure(
-        base.search.samples,
-        base.start.model.wiring,
-        outcome.last.fit.residual,
-        noise_lag1=base.noise.lag1,
-        correlation=base.search.row_correlation,
-        doubt=base.noise.uncertainty,
-    )
-    explained = explain(log, base, outcome)
-    base = replace(base, noise=base.noise.below(explained.train_error.after))
-    again = visits(log.samples, explained.start.model, explained.start.theta)
-    remaining = remaining.with_memory(again.compare(explained.after))
-    grounds = verdict_on(base, outcome, explained, remaining)
-    result = assemble(log, base, outcome, explained, remaining, grounds, again)
+    result = _concluded(log, base, outcome)
     # what was asked of a robot with other tendons is answered
     questions = reading.questions if base.without is None else filter(None, [time_question(some)])
     result = replace(result, notes=[*questions, *result.notes])
@@ -152,24 +138,47 @@ def identify(
     )
 
 
+def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
+    """All that follows from what a search has found."""
+    remaining = residual_structure(
+        base.search.samples,
+        base.start.model.wiring,
+        outcome.last.fit.residual,
+        noise_lag1=base.noise.lag1,
+        correlation=base.search.row_correlation,
+        doubt=base.noise.uncertainty,
+    )
+    explained = explain(log, base, outcome)
+    base = replace(base, noise=base.noise.below(explained.train_error.after))
+    again = visits(log.samples, explained.start.model, explained.start.theta)
+    remaining = remaining.with_memory(again.compare(explained.after))
+    grounds = verdict_on(base, outcome, explained, remaining)
+    return assemble(log, base, outcome, explained, remaining, grounds, again)
+
+
 def _in_motion(
     log: SplitLog,
     robot: Robot,
     model: Model,
+    excluded: frozenset[str],
+    max_effects: int,
     progressed: Callable[[str, int, int], None],
     threads: int | None,
 ) -> Result:
-    """The robot's own parameters, fitted to all training rows in motion."""
-    done, most = 0, len(HORIZONS) + 2
-
-    def report(what: str) -> None:
-        nonlocal done
-        progressed(what, done, most)
-        done += 1
-
-    found = fit_motion(log.samples.on(log.rows), model, robot, threads=threads, report=report)
+    """What the model of `robot` in motion lacks."""
+    most = max_effects + _SPARE + 2
+    base = fit_motion(
+        log.samples.on(log.rows),
+        model,
+        robot,
+        excluded,
+        threads=threads,
+        report=lambda what: progressed(what, 0, most),
+    )
+    progressed(base.sentence, 0, most)
+    outcome = _searched(base, max_effects, progressed)
     progressed("prediction on all samples", most - 1, most)
-    return assemble_motion(log, robot, found, threads)
+    return _concluded(log, base, outcome)
 
 
 def _found(

@@ -55,7 +55,7 @@ class MotionReplay:
             rods,
             dt=clock.dt,
             points_per_segment=4,
-            outputs="full" if self.points else "tip",
+            outputs="full" if self.points or robots[0].effects else "tip",
             threads=self.threads or 1,
             dynamics=True,
         )

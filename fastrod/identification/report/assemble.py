@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.effects.base import get_effect, has_memory
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
+from fastrod.identification.log.forward import LogSamples, PredictedPose
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.registration import between, frame_of
 from fastrod.identification.log.split import SplitLog, thinned
@@ -80,12 +80,14 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     """The base model and what was found beside it, predicted on every sample of a log."""
     search, state, names = outcome.search, outcome.state, outcome.names
     samples, rows = log.samples, thinned(log.rows, ALL_AT_ONCE)
-    if search.rod.of_modes:  # each row costs much more, and the search saw enough of them
+    # each row of a rod of modes costs much more, and the search saw enough of them; in motion it saw all
+    if search.rod.of_modes or search.in_motion:
         rows = search.samples.rows
     start = outcome.start
     if len(names) > 1:
         names = tuple(names[i] for i in np.argsort([-_own(state, name) for name in names]))
-    if len(rows) > len(search.samples.rows) or (names and _flags_moved(search, state, base)):
+    seen_all = search.in_motion or not (names and _flags_moved(search, state, base))
+    if len(rows) > len(search.samples.rows) or not seen_all:
         piece = samples.on(rows)
         search = search_on(piece, base, search.target.sigma, state)
         state = _nearer(state, search.again(state), piece, base)
@@ -296,8 +298,7 @@ def _left_out(explained: Explained, error: Error) -> list[str]:
 
 
 def _predicted(state: ModelState, piece: LogSamples, base: BaseFit) -> PredictedPose:
-    rod = PredictedRod(piece, base.robot, threads=base.search.rod.threads)
-    return predict(state.model, state.theta, piece, rod)
+    return base.search.predict(state.model, state.theta, piece)
 
 
 def _nearer(one: ModelState, other: ModelState, piece: LogSamples, base: BaseFit) -> ModelState:
@@ -510,8 +511,7 @@ def _tips(model: Model, theta: Floats, samples: LogSamples, base: BaseFit) -> Fl
     tip = np.full((len(samples.log), 3), np.nan)
     for start in range(0, len(tip), ALL_AT_ONCE):
         rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
-        piece = samples.on(rows)
-        pose = predict(model, theta, piece, PredictedRod(piece, base.robot, threads=base.search.rod.threads))
+        pose = base.search.predict(model, theta, samples.on(rows))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip
 

@@ -107,6 +107,11 @@ class Bound:
     """nan: no size shows in this log."""
 
 
+def unfitted(name: str, why: str, n_parameters: int = 0) -> Candidate:
+    """A candidate that was not fitted, and why not."""
+    return Candidate(name, None, 0.0, 0.0, 0.0, n_parameters, why)
+
+
 def advantage(one: Candidate, other: Candidate) -> float:
     """BIC by which one candidate is better than the other, with the effective samples of the one that leaves
     less."""

@@ -1,23 +1,34 @@
-"""The fit of a robot's own parameters in motion: least squares with priors, and slopes by differences.
+"""The search in motion: the same candidates and the same evidence as at rest, beside rods that have inertia.
 
-A difference is a robot of the batch: one that is as fitted so far, and one for each unknown.
+No slope by inputs holds for a rod that moves, so every model is moved in time, many side by side: of a
+candidate first what it does at its starts; then those that promise most are fitted, with the slopes that are
+known of what they stand beside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar, cast
 
 import numpy as np
 
-from fastrod.errors import LogError
+from fastrod.effects.base import effect_names, get_effect, trait
+from fastrod.effects.executor import reads_bend, reads_tension
+from fastrod.effects.pipeline import named_effects
+from fastrod.errors import LogError, RobotError
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose
 from fastrod.identification.log.motion import MotionReplay
 from fastrod.identification.log.noise import Noise, keep, read_noise
-from fastrod.identification.log.unknowns import Model, Unknown, known_model
-from fastrod.identification.search.base import SEEN
-from fastrod.identification.search.linearised import ANGLE, Target, target_of
+from fastrod.identification.log.unknowns import Model, Unknown
+from fastrod.identification.search.base import SEEN, BaseFit
+from fastrod.identification.search.linearised import ANGLE, LinearisedModel, Target, target_of
+from fastrod.identification.search.model_selection import Candidate, ModelState, unfitted
+from fastrod.identification.search.search import N_BLOCKS, Search, starts_of
 from fastrod.identification.search.solve import Estimate, Fit, minimise, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
@@ -28,70 +39,222 @@ of a step's Newton method would show, 1e-6 of the bend."""
 HORIZONS = (0.06, 0.12, 0.25, 0.5, 1.0, 1.0)
 """Fractions of each run that are fitted one after the other: an oscillation that is off by half a period at
 the end of a run pulls its frequency to a neighbour."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MotionFit:
-    """A model fitted in motion at the rows of its samples."""
-
-    model: Model
-    """Its unknowns are those that the log can see."""
-    fit: Fit
-    target: Target
-    noise: Noise
-    fixed: dict[str, Estimate]
-    """Those that it cannot; they stay nominal."""
-    notes: tuple[str, ...]
-    solves: int
-    """Batches of rods in motion."""
+_MOST = 48  # robots of a batch
+_FITTED = 4  # candidates of a stage that are fitted
+_PROMISING = 0.3  # of what the best promises: others are not fitted
+_ITERATIONS = 6
 
 
 @dataclass(eq=False)
-class _Problem:
-    """Residuals and slopes of one batch; both come from one batch."""
+class MotionRod:
+    """What rods do in motion at the rows of `samples`, each robot once."""
 
-    replay: MotionReplay
-    target: Target
-    solves: int = 0
+    samples: LogSamples
+    points: bool = False
+    threads: int | None = None
+    runs: int = 0
+    """Batches moved so far."""
+    cost: float = 0.0
+    """Passes of a row beyond which nothing new is tried: in motion only time counts."""
+    of_modes: ClassVar[bool] = False
+    _known: dict[str, PredictedPose] = field(default_factory=dict)
 
-    def at(self, model: Model, theta: Floats) -> tuple[Floats, Floats]:
-        """(n, n_out) residual and (n, n_out, p) slopes of the prediction; nan where the rod is lost."""
+    def poses(self, robots: Sequence[Robot]) -> list[PredictedPose]:
+        """What the camera sees of each of these robots."""
+        new = {repr(robot): robot for robot in robots if repr(robot) not in self._known}
+        for keys, batch in _batches(new):
+            replay = MotionReplay(self.samples, points=self.points, threads=self.threads)
+            self._known |= zip(keys, replay.poses(batch), strict=True)
+            self.runs += 1
+        return [self._known[repr(robot)] for robot in robots]
+
+
+def _batches(robots: dict[str, Robot]) -> Iterator[tuple[list[str], list[Robot]]]:
+    """Robots that may move side by side: with the same effects, neutral where one has none, and the same
+    geometry, which effects need; those whose effects go by what the rod does, which takes longer, apart."""
+    some = any(robot.effects for robot in robots.values())
+    alike: dict[object, list[str]] = {}
+    for key, robot in robots.items():
+        slow = tuple(name for name in named_effects(robot) if _follows(name))
+        alike.setdefault((slow, _geometry(robot) if some else None), []).append(key)
+    for keys in alike.values():
+        names = {name for key in keys for name in named_effects(robots[key])}
+        order = [name for name in effect_names() if name in names]
+        for first in range(0, len(keys), _MOST):
+            batch = keys[first : first + _MOST]
+            yield batch, [_with_effects(robots[key], order) for key in batch]
+
+
+def _follows(name: str) -> bool:
+    what = get_effect(name)
+    return reads_bend(what) or reads_tension(what)
+
+
+def _geometry(robot: Robot) -> tuple[object, ...]:
+    return tuple((s.length, tuple((t.offset, t.angle) for t in s.tendons)) for s in robot.segments)
+
+
+def _with_effects(robot: Robot, names: Sequence[str]) -> Robot:
+    tables = named_effects(robot)
+    return replace(robot, effects=tuple({"name": name, **tables.get(name, {})} for name in names))
+
+
+class MotionModel:
+    """The model `model` at `theta` in motion, and all models near it; as `LinearisedModel` is at rest, but
+    exact everywhere."""
+
+    def __init__(
+        self, model: Model, theta: Floats, samples: LogSamples, rod: MotionRod, target: Target
+    ) -> None:
+        self.model, self.theta, self.samples, self.rod, self.target = (
+            model,
+            theta.copy(),
+            samples,
+            rod,
+            target,
+        )
+
+    @cached_property
+    def pose(self) -> PredictedPose:
+        """What the camera sees."""
+        return self.rod.poses([self.model.identified(self.theta)])[0]
+
+    def under(self, target: Target) -> MotionModel:
+        """The same, weighed otherwise."""
+        made = copy(self)
+        made.target = target
+        return made
+
+    def is_light(self, _: str) -> bool:
+        """Whether an effect needs no rod to be solved: here every one does, and the fit has done it."""
+        return True
+
+    def residual(self, model: Model, theta: Floats) -> Floats:
+        """(n, n_out) weighted; infinite where no robot has these numbers, or it is lost on the way."""
+        shape = (len(self.samples.rows), 3 + 3 * (self.target.rotation is not None))
+        try:
+            (pose,) = self.rod.poses([model.identified(theta)])
+        except RobotError:
+            return np.full((shape[0], shape[1] + 3 * self.target.points.shape[1]), np.inf)
+        found = self.target.residual(pose)
+        return found if pose.ok[self.target.weight > 0.0].all() else np.full_like(found, np.inf)
+
+    def slopes(self, model: Model, theta: Floats, residual: Floats, known: Floats | None = None) -> Floats:
+        """(n, n_out, p) of the prediction, by differences; those by the first unknowns may be `known`."""
+        n_known = 0 if known is None else known.shape[-1]
         steps = _steps(model, theta)
-        thetas = [theta, *(theta + np.diag(steps))]
-        poses = self.replay.poses([model.identified(each) for each in thetas])
-        self.solves += 1
-        every = [_residual(self.target, pose) for pose in poses]
-        slopes = [(every[0] - other) / step for other, step in zip(every[1:], steps, strict=True)]
-        return every[0], np.stack(slopes, axis=-1) if slopes else np.zeros((*every[0].shape, 0))
+        moved = (theta + np.diag(steps))[n_known:]
+        self.rod.poses([model.identified(each) for each in moved])
+        every = [
+            np.nan_to_num((residual - self.residual(model, each)) / step, posinf=0.0, neginf=0.0)
+            for each, step in zip(moved, steps[n_known:], strict=True)
+        ]
+        own = np.stack(every, axis=-1) if every else np.zeros((*residual.shape, 0))
+        return own if known is None else np.concatenate([known, own], axis=-1)
 
-    def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
-        """The best parameters from `start` (p,) on, within limits and under priors."""
-        last: dict[bytes, tuple[Floats, Floats]] = {}
+    def fit(self, model: Model, start: Floats, iterations: int, known: Floats | None = None) -> Fit:
+        """The best parameters from `start` (p,) on, within limits and under priors; slopes by the first
+        unknowns may be `known`. A step and the slopes there are one batch."""
 
         def residual(theta: Floats) -> Floats:
-            last.clear()
-            last[theta.tobytes()] = self.at(model, theta)
-            return last[theta.tobytes()][0]
+            first = 0 if known is None else known.shape[-1]
+            moved = (theta + np.diag(_steps(model, theta)))[first:]
+            with suppress(RobotError):  # a trial that is no robot is a worse one
+                self.rod.poses([model.identified(each) for each in (theta, *moved)])
+            return self.residual(model, theta)
 
-        def slopes(theta: Floats, _: Floats) -> Floats:
-            return np.nan_to_num(last[theta.tobytes()][1])
+        def slopes(theta: Floats, r: Floats) -> Floats:
+            return self.slopes(model, theta, r, known)
 
         return minimise(residual, slopes, start, *model.prior, model.limits, iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSearch(Search):
+    """The search beside rods in motion. Alternative patterns and bounds are not asked for: both take slopes
+    by the rod's inputs."""
+
+    rod: MotionRod  # type: ignore[assignment]
+    in_motion: ClassVar[bool] = True
+
+    def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
+        """What the camera sees at the rows of `samples`."""
+        return MotionRod(samples, self.rod.points, self.rod.threads).poses([model.identified(theta)])[0]
+
+    def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
+        """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
+        [m], and the search with these."""
+        before = self.target.sigma
+        size = max(rms(state.fit.residual), float((noise / before).max()))
+        search = replace(self, target=self.target.weighed(before * size, noise))
+        linearised = state.linearised.under(search.target)
+        fit = linearised.fit(state.model, state.theta, 3, state.fit.slopes / size)
+        return search, search._state(state.model, linearised, fit, ())
+
+    def _near(self, model: Model, theta: Floats) -> LinearisedModel:
+        return cast(LinearisedModel, MotionModel(model, theta, self.samples, self.rod, self.target))
+
+    def names(self, state: ModelState) -> list[str]:
+        """Effects that may be tried; none that goes by where the tip is, whose balance a step does not
+        solve."""
+        return [name for name in super().names(state) if not trait(get_effect(name), "feels_tip")]
+
+    def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
+        """The candidates that promise most, fitted; of the others that they promise less."""
+        self.report("what each does")
+        n, models = len(state.model.unknowns), {name: state.model.with_effect(name) for name in names}
+        every: list[Robot] = []
+        for name, model in models.items():
+            sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+            at_zero = np.concatenate([state.theta, model.start[n:]])
+            at_zero[sizes] = [model.unknowns[j].mean for j in sizes]
+            steps = np.diag([u.scale for u in model.unknowns])[sizes]
+            thetas = [at_zero, *np.clip(at_zero + steps, *model.limits)]
+            for start in starts_of(state, model, name):
+                thetas.append(start)
+                thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
+            every += [model.identified(theta) for theta in thetas]
+        self.rod.poses(every)
+        promise = {
+            name: max(self._promise(state, model, theta) for theta in starts_of(state, model, name))
+            for name, model in models.items()
+        }
+        first = sorted(promise, key=lambda name: -promise[name])[:_FITTED]
+        worth = [name for name in first if promise[name] > _PROMISING * promise[first[0]]]
+        return [
+            super(MotionSearch, self).candidate(state, name)
+            if name in worth
+            else unfitted(name, "it promises less than others", len(models[name].unknowns) - n)
+            for name in names
+        ]
+
+    def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
+        with np.errstate(invalid="ignore"):
+            found = super()._promise(state, model, theta)
+        return found if np.isfinite(found) else 0.0
+
+    def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
+        every = starts_of(state, model, name)
+        theta = max(every, key=lambda theta: self._promise(state, model, theta))
+        known = state.fit.slopes[..., : len(state.model.unknowns)]
+        return state.linearised.fit(model, theta, _ITERATIONS, known)
 
 
 def fit_motion(
     samples: LogSamples,
     model: Model,
     robot: Robot,
+    excluded: frozenset[str] = frozenset(),
     *,
     threads: int | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> MotionFit:
+) -> BaseFit:
     """The unknowns of `model` fitted at the rows of `samples`, in motion; those that this log cannot see stay
     nominal, with the reason. Raises `LogError` where the robot as given is lost on the way."""
     points = samples.log.points is not None and bool(robot.log_points)
     report("motion as given")
-    (pose,) = MotionReplay(samples, points=points, threads=threads).poses([model.identified(model.start)])
+    whole = MotionRod(samples, points, threads)
+    (pose,) = whole.poses([model.identified(model.start)])
     if not pose.ok.all():
         k = int(samples.rows[np.flatnonzero(~pose.ok)[0]])
         run = str(samples.log.run[k]) or samples.log.name
@@ -100,7 +263,7 @@ def fit_motion(
             "is a mass, a stiffness or a damping_time far off?"
         )
     target = target_of(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=ANGLE, points=points)
-    left, solves = target.tip - pose.position, 1
+    left, solves = target.tip - pose.position, 0
     noise = _noise(samples, robot, left)
     theta, fixed, every = model.start, dict[str, Estimate](), model
     for k, horizon in enumerate(HORIZONS):
@@ -110,41 +273,33 @@ def fit_motion(
         mine = np.isin(samples.rows, within.rows)
         own = target_of(within, target.sigma, rotation_sigma=ANGLE, points=points)
         own = replace(own, weight=good[mine].astype(float))
-        problem = _Problem(MotionReplay(within, points=points, threads=threads), own)
+        rod = whole if horizon == 1.0 else MotionRod(within, points, threads)
         if k == len(HORIZONS) - 2:  # what the whole log shows
-            problem.target = own.weighed(noise.sigma, noise.sigma)
-            fixed = _unseen(problem, every, theta, within)
+            at = MotionModel(every, theta, within, rod, own.weighed(noise.sigma, noise.sigma))
+            fixed = _unseen(at, every, theta)
             seen = [u.name not in fixed for u in every.unknowns]
             model, theta = replace(every, unknowns=_those(every.unknowns, seen)), theta[seen]
-        problem.target = _weighed(own, noise, left[mine][good[mine]])
-        fit = problem.fit(model, theta, 10)
-        theta, solves = fit.theta, solves + problem.solves
-        (pose,) = MotionReplay(samples, points=points, threads=threads).poses([model.identified(theta)])
-        solves += 1
+        own = _weighed(own, noise, left[mine][good[mine]])
+        moving = MotionModel(model, theta, within, rod, own)
+        fit = moving.fit(model, theta, 10)
+        theta, solves = fit.theta, solves + rod.runs * (rod is not whole)
+        (pose,) = whole.poses([model.identified(theta)])
         left = np.where(pose.ok[:, None], target.tip - pose.position, left)
         noise = _noise(samples, robot, left)
-    out = int((problem.target.weight == 0.0).sum())
+    out = int((own.weight == 0.0).sum())
     notes = (f"{out} of {len(samples.rows)} rows are outliers and do not count",) if out else ()
-    return MotionFit(
-        model=model, fit=fit, target=problem.target, noise=noise, fixed=fixed, notes=notes, solves=solves
-    )
-
-
-def as_given(robot: Robot) -> Robot:
-    """The robot with its own effects, nothing fitted."""
-    return known_model(robot).identified(np.zeros(0))
+    whole.runs += solves
+    n = len(samples.rows)
+    blocks = np.minimum(np.arange(n) * N_BLOCKS // n, N_BLOCKS - 1)
+    moved = MotionSearch(samples, whole, own, blocks, excluded, noise.sigma)
+    search, state = moved.weighed(moved._state(model, moved._near(model, theta), fit, ()), noise.sigma)
+    return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=notes)
 
 
 def _steps(model: Model, theta: Floats) -> Floats:
     high = model.limits[1]
     steps = np.array([1e-3 if u.log else _STEP * u.scale for u in model.unknowns])
     return np.where(theta + steps > high, -steps, steps)
-
-
-def _residual(target: Target, pose: PredictedPose) -> Floats:
-    """(n, n_out) weighted; nan where a row that counts is lost."""
-    found = target.residual(pose)
-    return np.where(((target.weight > 0.0) & ~pose.ok)[:, None], np.nan, found)
 
 
 def _weighed(target: Target, noise: Noise, left: Floats) -> Target:
@@ -177,11 +332,11 @@ def _those(unknowns: tuple[Unknown, ...], which: list[bool]) -> tuple[Unknown, .
     return tuple(u for u, keep_it in zip(unknowns, which, strict=True) if keep_it)
 
 
-def _unseen(problem: _Problem, model: Model, theta: Floats, samples: LogSamples) -> dict[str, Estimate]:
+def _unseen(at: MotionModel, model: Model, theta: Floats) -> dict[str, Estimate]:
     """Unknowns whose prior this log does not narrow, at the noise."""
     if not model.unknowns:
         return {}
-    J = np.nan_to_num(problem.at(model, theta)[1])
+    J = at.slopes(model, theta, at.residual(model, theta))
     flat, (_, sd) = J.reshape(-1, J.shape[-1]), model.prior
     spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat + np.diag(1.0 / sd**2))), 0.0))
     return {
@@ -190,7 +345,7 @@ def _unseen(problem: _Problem, model: Model, theta: Floats, samples: LogSamples)
             stderr=float(prior),
             unit=u.unit,
             identifiable=False,
-            why=advice.why_unknown(u.name, samples, model.robot),
+            why=advice.why_unknown(u.name, at.samples, model.robot),
             prior_sd=float(prior),
         )
         for u, narrowed, prior in zip(model.unknowns, spread, sd, strict=True)

@@ -1,9 +1,9 @@
 """The same command at another time: what differs between two visits is no function of the command.
 
-At two visits of one command the mean of the residual is static, half its difference is not. What follows from
-where the robot came from is memory: the product of the two residuals is s^2 + m^2 where it came by the same
-way, and s^2 - m^2 where it came by the other, s the static part and m that of memory; the rest of their square
-does not repeat. No model without memory leaves less than the visits' standard deviation.
+At two visits of one command the mean of the residual is static, half its difference is not. What follows
+from where the robot came from is memory: the product of the two residuals is s^2 + m^2 where it came by the
+same way, and s^2 - m^2 where it came by the other, s the static part and m that of memory; the rest of their
+square does not repeat. No model without memory leaves less than the visits' standard deviation.
 """
 
 from __future__ import annotations

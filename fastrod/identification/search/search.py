@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 
 from fastrod.effects.base import BodyOperator, effect_names, get_effect, has_memory, trait
 from fastrod.errors import RobotError
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
+from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
@@ -41,6 +42,7 @@ from fastrod.identification.search.model_selection import (
     best_of,
     by_estimate,
     equally_wrong,
+    unfitted,
     unphysical,
     z_between,
 )
@@ -90,6 +92,11 @@ class Search:
     row_correlation: Floats = field(default_factory=lambda: np.ones(1))
     """(k,) autocorrelation of the noise from row to row, until it has faded; (1,) of white noise."""
     report: Callable[[str], None] = field(default=lambda _: None)
+    in_motion: ClassVar[bool] = False
+
+    def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
+        """What the camera sees at the rows of `samples`, solved exactly."""
+        return predict(model, theta, samples, PredictedRod(samples, model.robot, threads=self.rod.threads))
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
@@ -101,6 +108,8 @@ class Search:
         """The same with the rod solved at the state's own parameters; with `borrow` its slopes are those of
         the last solution. A rod of modes is solved once more where the fit ends: no slope says where tendons
         go slack on the way."""
+        if self.in_motion:  # every fit is exact
+            return state
         linearised, theta = self._solved(state)
         if borrow:
             linearised = linearised.borrowing(state.linearised)
@@ -181,9 +190,12 @@ class Search:
         iterations: int,
     ) -> ModelState:
         """The state at the best parameters near `theta` (p,), where the rod is solved."""
-        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        linearised = self._near(model, theta)
         fit = self._fit(linearised, model, theta, amplitudes, found, iterations)
         return self._state(model, linearised, fit, found)
+
+    def _near(self, model: Model, theta: Floats) -> LinearisedModel:
+        return LinearisedModel(model, theta, self.samples, self.rod, self.target)
 
     def _state(
         self, model: Model, linearised: LinearisedModel, fit: Fit, found: tuple[AlternativePattern, ...]
@@ -243,12 +255,12 @@ class Search:
         its passes. Where this log shows that it is one drive's, of that drive alone; where it shows another
         law of the same cause, that law."""
         if self.spent:
-            return _unfitted(name, "not tried: the model hardly converges on this log")
+            return unfitted(name, "not tried: the model hardly converges on this log")
         if trait(get_effect(name), "by_pattern"):
             found = [
                 c for c in self.pattern_effects(state, self.alternative_candidates(state)) if c.name == name
             ]
-            return found[0] if found else _unfitted(name, "no pattern of it fits")
+            return found[0] if found else unfitted(name, "no pattern of it fits")
         best = self._candidate(state, name)
         laws = [name, *(other for other in effect_names() if trait(get_effect(other), "refines") == name)]
         variants: list[tuple[str, int | None]] = [(law, None) for law in laws[1:] if law not in self.excluded]
@@ -263,12 +275,13 @@ class Search:
     def _drive(self, state: ModelState, name: str) -> int | None:
         """The drive by which alone an effect promises most; None where drives do not differ by it."""
         count = state.model.wiring.n_drives
-        if count < 2 or not any(p.shared for p in get_effect(name).parameters):
+        if count < 2 or self.in_motion or not any(p.shared for p in get_effect(name).parameters):
             return None
         promises = []
         for drive in range(count):
             model = state.model.with_effect(name, drive=drive)
-            promises.append(max(self._promise(state, model, theta) for theta in _starts(state, model, name)))
+            every = starts_of(state, model, name)
+            promises.append(max(self._promise(state, model, theta) for theta in every))
         best = int(np.argmax(promises))
         return best if promises[best] >= _SCREEN * state.fit.loss else None
 
@@ -277,12 +290,12 @@ class Search:
         added = state.model.with_effect(name, drive=drive).unknowns[len(state.model.unknowns) :]
         if all(u.name.partition(".")[2] in drop for u in added if not u.shape):
             shown_by = trait(get_effect(name), "excited_by") or "no response"
-            return _unfitted(name, f"this log does not excite it: {shown_by}")
+            return unfitted(name, f"this log does not excite it: {shown_by}")
         model = state.model.with_effect(name, drop=drop, drive=drive)
-        fits = self._from_starts(state, model, name)
+        fits = self._fromstarts_of(state, model, name)
         if fits is None:
             n_more = len(model.unknowns) - len(state.model.unknowns)
-            return _unfitted(name, "its slopes promise nothing", n_more)
+            return unfitted(name, "its slopes promise nothing", n_more)
         return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
     def _unseen(self, state: ModelState, name: str, drive: int | None) -> list[str]:
@@ -305,10 +318,10 @@ class Search:
                 unseen.append(u.name.partition(".")[2])
         return unseen
 
-    def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
+    def _fromstarts_of(self, state: ModelState, model: Model, name: str) -> Fit | None:
         linearised, n = state.linearised, len(state.model.unknowns)
         amplitudes = state.fit.theta[n:]
-        promising = [(self._promise(state, model, theta), theta) for theta in _starts(state, model, name)]
+        promising = [(self._promise(state, model, theta), theta) for theta in starts_of(state, model, name)]
         promising.sort(key=lambda pair: -pair[0])
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
@@ -393,7 +406,9 @@ class Search:
 
     def alternative_candidates(self, state: ModelState) -> list[Candidate]:
         """The best alternative pattern of each family beside a state, linear in everything."""
-        made = []
+        made: list[Candidate] = []
+        if self.in_motion:  # they take slopes by the rod's inputs
+            return made
         for alternative in alternatives(state.linearised, state.fit.slopes, state.fit.residual):
             # a row without a shape tells nothing
             columns = np.where(np.isfinite(alternative.columns), alternative.columns, 0.0)
@@ -605,7 +620,7 @@ class Search:
         flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
         base = flat.T @ flat + np.diag(state.fit.precision)
         made = []
-        for name in self.names(state):
+        for name in () if self.in_motion else self.names(state):
             model = state.model.with_effect(name)
             n = len(state.model.unknowns)
             theta = np.concatenate([state.theta, model.start[n:]])
@@ -661,7 +676,7 @@ def _yields(robot: Robot) -> bool:
     )
 
 
-def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
+def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
     """Where fits of `model` begin, which has an effect more than `state`: its parameters' starts."""
     added = model.unknowns[len(state.model.unknowns) :]
     starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
@@ -703,10 +718,6 @@ def _distinct(one: Candidate, other: Candidate) -> bool:
 
 def _clearly_better(one: Candidate, other: Candidate) -> bool:
     return advantage(one, other) > BIC_RIVAL and z_between(one, other) > Z_RIVAL
-
-
-def _unfitted(name: str, why: str, n_parameters: int = 0) -> Candidate:
-    return Candidate(name, None, 0.0, 0.0, 0.0, n_parameters, why)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
