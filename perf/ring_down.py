@@ -146,7 +146,7 @@ def compared(log: RunLog, robot: Robot, fitted: str, checked: str, shear: bool) 
     """Two repeats of one load: frequency of the `checked` one with nothing fitted, its amplitude with the
     damping time that was fitted on the other."""
     run = log.only(checked)
-    load = 0.0 if run.tip_force is None else -float(run.tip_force[0, 0])
+    load = 0.0 if run.payload is None else 9.81 * float(run.payload[0])
     ring = measured_ring(run)
     (free,) = rings([beam(robot, load, shear=shear)], ring.start)
     damping_time = damping_of(measured_ring(log.only(fitted)), robot, load, shear)

@@ -19,10 +19,11 @@ from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
+from fastrod.identification.report.motion import named_inertia
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
-from fastrod.identification.search.motion import fit_motion
+from fastrod.identification.search.motion import damped, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
@@ -97,6 +98,8 @@ def identify(
     model = base_model(robot, free_camera=free_camera, dynamics=dynamics)
     if dynamics:
         return _in_motion(log, robot, model, frozenset(exclude), max_effects, progressed, threads)
+    if max_effects and (found := _rings(log, robot, progressed, threads)):
+        return found
     progressed("registration", 0, most)
     some = log.samples.on(thinned(log.rows, _FEW_ROWS))
     reading = read(some, robot, threads=threads)
@@ -156,6 +159,25 @@ def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
     return assemble(log, base, outcome, explained, remaining, grounds, again)
 
 
+def _rings(
+    log: SplitLog, robot: Robot, progressed: Callable[[str, int, int], None], threads: int | None
+) -> Result | None:
+    """What the model at rest lacks of a robot with a mass that was let go: inertia and damping; None where it
+    was not, or where these do not explain much."""
+    if log.swings is None or not all(s.line_density > 0.0 for s in robot.segments):
+        return None
+    log = log.swings
+    progressed("base fit", 0, 1)
+    some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
+    still = fit_base(some, log.rows, base_model(robot), robot, frozenset(), threads)
+    progressed("inertia and damping", 0, 1)
+    moved = damped(robot)
+    moving = fit_motion(log.samples.on(log.rows), base_model(moved, dynamics=True), moved, threads=threads)
+    if moving.left > _LESS * still.left:
+        return None
+    return named_inertia(_concluded(log, moving, _searched(moving, 0, progressed)), log, still, moving)
+
+
 def _in_motion(
     log: SplitLog,
     robot: Robot,
@@ -166,7 +188,7 @@ def _in_motion(
     threads: int | None,
 ) -> Result:
     """What the model of `robot` in motion lacks."""
-    most = max_effects + _SPARE + 2
+    most, log = max_effects + _SPARE + 2, log.swings or log
     base = fit_motion(
         log.samples.on(log.rows),
         model,

@@ -186,7 +186,7 @@ def ethz_beam(
 
     Published: dimensions, density, modulus (the shipped robot `ethz_beam` has them), tip load, gravity. The
     load hangs from the upper edge of the tip face; here it acts at the centre. `tip_force` = the load along
-    -x, constant.
+    -x, constant; of whole runs, in which it swings too, `payload` = its mass.
     `settled`: the tip counts as measured in the last so many seconds of a run; what comes before, held by
     hand and then ringing at 4 to 8 Hz, is given as missing, for a static model says nothing about it. None
     gives the whole run.
@@ -195,6 +195,7 @@ def ethz_beam(
     table, where = _table(path, "ethz_beam"), Path(path).name
     tip = np.mean([_metres(table, [f"tip{k}_{axis}_mm" for axis in "xyz"], where) for k in (1, 2, 3)], axis=0)
     labels, t = np.array(table["run"]), numbers(table, "t_s", where)
+    load = numbers(table, "tip_load_N", where)
     for label in dict.fromkeys(labels.tolist()):
         rows = labels == label
         tip[rows] += (0.0, 0.0, robot.length) - tip[rows][0]
@@ -206,7 +207,8 @@ def ethz_beam(
         run=labels,
         dl=np.zeros((len(t), 0)),
         tip_position=tip,
-        tip_force=numbers(table, "tip_load_N", where)[:, None] * (-1.0, 0.0, 0.0),
+        tip_force=None if settled is None else load[:, None] * (-1.0, 0.0, 0.0),
+        payload=load / 9.81 if settled is None else None,
     )
     return log if run is None else log.only(run), robot
 

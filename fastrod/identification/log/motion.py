@@ -1,4 +1,5 @@
-"""A log through rods in motion: each run from rest at its first sample on, many robots side by side.
+"""A log through rods in motion: each run from rest at its first sample on, many robots side by side; a robot
+that was let go, from where it turns back.
 
 Time steps are even and no longer than `LONGEST_STEP`; between two samples the inputs go evenly from one to
 the other. A payload is a mass at the tip here, with its inertia, and not only a weight.
@@ -19,12 +20,17 @@ from fastrod.identification.log.forward import LogSamples, PredictedPose, sample
 from fastrod.identification.log.inputs import inputs
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Lump, Robot
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Ints
 
 LONGEST_STEP = 1e-3
 """s. Generalized-alpha is second order; `identify` says what half of it would change."""
 _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
+_SWINGS = 10.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
+_HELD = 0.1  # of the first displacement: a tip that has gone so far is no longer held
+_HOLDS = 6  # Newton steps to the force that holds the tip
+_STIFF = 0.02  # of the softest direction: along others nothing holds a tip
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +67,15 @@ class MotionReplay:
         )
         given = _prepared(self.samples, robots[0])
         alive, seen = np.ones(len(rods), bool), list[Floats]()
+        held = np.tile(_beside_rest(self.samples, runs), (len(robots), 1))
+        held = held @ matrix_from_quaternion(np.array([robots[0].base_quaternion]))[0].T
         kept = np.zeros((len(clock.wanted), len(rods)), bool)
         last = int(clock.wanted[-1])
         for step in range(last + 1):
             now: dict[str, Any] = {
                 name: np.tile(a, (len(robots), *[1] * (a.ndim - 1))) for name, a in clock.at(step, given)
             }
-            state = sim.step(**now) if step else sim.settle(**now)
+            state = sim.step(**now) if step else _held(sim, sim.settle(**now), held, now)
             alive &= state.ok
             if step == clock.wanted[len(seen)]:
                 kept[len(seen)] = alive
@@ -124,12 +132,75 @@ class MotionReplay:
         return [float(payload[span.start]) for span in runs]
 
 
+def let_go(log: RunLog) -> RunLog:
+    """The log without what comes before a robot swings that was pulled aside and let go: in runs whose inputs
+    never change, up to where the tip turns back for the first time. How it was held and let go no log says;
+    there it is at rest, and a force on the tip holds it."""
+    t = log.t.copy()
+    for label in log.runs:
+        rows = np.flatnonzero((log.run == label) & log.measured)
+        if (k := _turning_point(log, rows)) is not None:
+            t[(log.run == label) & (np.arange(len(t)) < rows[k])] = np.nan
+    return log if np.array_equal(t, log.t, equal_nan=True) else replace(log, t=t)
+
+
+def _turning_point(log: RunLog, rows: Ints) -> int | None:
+    """Which of the rows of a run that is let go is the first at which the tip turns back; None where it is
+    driven, or rests."""
+    if len(rows) < 20 or not _is_still(log.rows(rows)):
+        return None
+    tip = np.asarray(log.tip_position)[rows]
+    off = tip - np.median(tip[-len(tip) // 10 :], axis=0)
+    _, _, axes = np.linalg.svd(off, full_matrices=False)
+    x = off @ axes[0]
+    if np.abs(x).max() < _SWINGS * max(float(x[-len(x) // 10 :].std()), 1e-12):
+        return None
+    begun = int(np.argmax(np.abs(x - x[0]) > _HELD * np.abs(x).max()))
+    turns = (np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & (np.abs(x[1:-1]) > _HELD * np.abs(x).max())
+    later = np.flatnonzero(turns[begun:])
+    return begun + 1 + int(later[0]) if len(later) else None
+
+
+def _is_still(log: RunLog) -> bool:
+    """Whether no input changes."""
+    inputs = (log.dl, log.ext, log.tip_force, log.payload, log.base_quaternion)
+    return all(np.ptp(a, axis=0).max(initial=0.0) < 1e-9 for a in inputs if a is not None)
+
+
+def _beside_rest(samples: LogSamples, runs: Sequence[slice]) -> Floats:
+    """(n_runs, 3) where the tip is held at the start of each run beside where it ends, base frame [m]; 0 of
+    runs that are driven."""
+    found = np.zeros((len(runs), 3))
+    for k, span in enumerate(runs):
+        log = samples.log.rows(span)
+        tip = np.asarray(log.tip_position)[log.measured]
+        if len(tip) >= 20 and _is_still(log):
+            end = tip[-len(tip) // 10 :]
+            off = tip[0] - np.median(end, axis=0)
+            if np.linalg.norm(off) > _SWINGS * np.linalg.norm(end.std(axis=0)):
+                found[k] = off
+    return found
+
+
+def _held(sim: Any, rest: Any, off: Floats, given: Mapping[str, Any]) -> Any:
+    """The state at rest with each tip held `off` (n_rods, 3) from where it would be [m], by a force on it."""
+    if not off.any():
+        return rest
+    aim, force, state = rest.tip_position + off, np.zeros_like(off), rest
+    own = given.get("tip_force", 0.0)
+    for _ in range(_HOLDS):
+        soft = sim.compliance()[:, :3]
+        force = force + np.einsum("nij,nj->ni", np.linalg.pinv(soft, rcond=_STIFF), aim - state.tip_position)
+        state = sim.settle(**{**given, "tip_force": own + force})
+    return state
+
+
 def predict_motion(
     log: RunLog, robot: Robot, *, points: bool = False, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Floats, Floats, Flags]:
     """Tip (n, 3) and the robot's `log_points` (n, k, 3) at every row of `log`, in its base frame [m], and
     which rows (n,) are found; k is 0 without `points`. Raises what `MotionReplay.poses` does."""
-    samples = sample(log)
+    samples = sample(let_go(log))
     every = samples.on(np.arange(len(samples.log)))
     (pose,) = MotionReplay(every, points=points).poses([robot], progress)
     tip, ok = np.full((len(log), 3), np.nan), np.zeros(len(log), bool)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fastrod.errors import InputError, LogError, UnknownNameError, nearest
 from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.motion import let_go
 from fastrod.logs.drives import sentences
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -34,6 +35,9 @@ class SplitLog:
     """What these are, in words."""
     drives: Sequence[str] = ()
     """What its drives did of their commands, where they were measured, in sentences."""
+    swings: SplitLog | None = None
+    """The same of runs that were let go from where they turn back, for a fit in motion; None where none
+    was."""
 
 
 def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> SplitLog:
@@ -52,6 +56,11 @@ def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> Spli
             f"log {log.name!r} has no row in which every input is there; there is nothing to "
             "drive the model with."
         )
+    whole, cut = _cut(log, robot, held_out), let_go(log)
+    return whole if cut is log else replace(whole, swings=_cut(cut, robot, held_out))
+
+
+def _cut(log: RunLog, robot: Robot, held_out: Sequence[str]) -> SplitLog:
     samples = sample(log)
     check_log(samples, robot)
     tested, labels = held_out_rows(samples, held_out)

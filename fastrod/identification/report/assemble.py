@@ -94,10 +94,10 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
         # with its own weights: what the base model does not explain must not push its parameters
         again = search_on(piece, base, base.search.target.sigma, state).again(start)
         start = _nearer(start, again, piece, base)
-    bare = _everywhere(start, samples, base)
+    bare = tips_of(start, samples, base)
     given = base.without
-    before = _everywhere(given.start, given.search.samples, given) if given else bare
-    after = _everywhere(state, samples, base) if names else bare
+    before = tips_of(given.start, given.search.samples, given) if given else bare
+    after = tips_of(state, samples, base) if names else bare
     measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
     residual = np.asarray(samples.log.tip_position) - after
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
@@ -169,7 +169,6 @@ def assemble(
     final = explained.state if kept else explained.start
     before, after, path = explained.before, explained.after, _path(explained, log, base)
     train_error, test_error = explained.train_error, explained.test_error
-    shipped = _shipped(base, explained)
     if not kept:
         after, path, length = explained.bare, path[: 2 if base.without else 1], noise.model.length
         measured = samples.log.measured
@@ -198,7 +197,8 @@ def assemble(
     ]
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept}
     ambiguous = grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
-    say_limits = grounds.left > _SAY_LIMITS or not robot.n_tendons
+    at_rest = not base.search.in_motion
+    say_limits = at_rest and (grounds.left > _SAY_LIMITS or not robot.n_tendons)
     strain = strained(base_estimates)
     other_sessions = dict(enumerate(final.model.sessions[1:], 1))
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
@@ -206,7 +206,7 @@ def assemble(
     said += _stand_ins(kept, final)
     said += _sentences(limits(robot, samples)) if say_limits else []
     revisits = [again.compare(tip) for tip in (before, after)]
-    if revisits[1] and revisits[1].elsewhere > _RETURNS * noise.floor:
+    if at_rest and revisits[1] and revisits[1].elsewhere > _RETURNS * noise.floor:
         said += _sentences([revisits[1].sentence()])
     return Result(
         log=samples.log,
@@ -244,7 +244,7 @@ def assemble(
             *_left_out(explained, test_error),
         ],
         solves=base.search.rod.runs,
-        as_given_rms=shipped,
+        as_given_rms=shipped(base, explained.used, explained.test),
         revisits=(revisits[0], revisits[1]) if revisits[0] and revisits[1] else None,
     )
 
@@ -330,12 +330,12 @@ def _own(state: ModelState, name: str) -> float:
     return float(((with_it - without) ** 2).sum())
 
 
-def _shipped(base: BaseFit, explained: Explained) -> tuple[float, float]:
+def shipped(base: BaseFit, used: Flags, test: Flags) -> tuple[float, float]:
     """Error of the robot file as it is, nothing fitted, on fitted and on held-out samples [m]."""
     given = base.without or base
     samples = given.search.samples
     tip = _tips(known_model(given.robot), np.zeros(0), samples, given)
-    fitted, held_out = (error_of(samples, tip, tip, rows).before for rows in (explained.used, explained.test))
+    fitted, held_out = (error_of(samples, tip, tip, rows).before for rows in (used, test))
     return fitted, held_out
 
 
@@ -501,7 +501,7 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
 
-def _everywhere(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
+def tips_of(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
     """(n, 3) predicted tip of every driven sample [m]; nan where the rod did not converge."""
     return _tips(state.model, state.theta, samples, base)
 
@@ -559,7 +559,7 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
     """Error after each effect, added in the order of what each brings."""
 
     def stage(name: str, at: ModelState) -> SearchStage:
-        tip = _everywhere(at, log.samples, base)
+        tip = tips_of(at, log.samples, base)
         errors = [
             float(np.sqrt(_distance(log.samples, tip, which).mean())) if which.any() else float("nan")
             for which in (explained.used, explained.test)

@@ -10,12 +10,14 @@ import numpy as np
 
 from fastrod.effects.base import Signal, get_effect, signal_of
 from fastrod.identification.report.result import Found, Result
+from fastrod.identification.report.wording import BASE_MODELS
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.model.routing import route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Ints
 
 _BINS = 24
+_TIME = "time since the start of the run [s]"
 _ACROSS = 0.12  # of the largest bend: motion that counts as along one direction
 _DIRECTIONS = 4
 _LEAST_LOOP = 50  # rows
@@ -72,11 +74,12 @@ class Signals:
 
     def view(self, found: Found) -> SignalView:
         """The residual against what explains this effect."""
-        if found.name == ONE_SIDED:
-            return self._over_bend()
+        if found.name in BASE_MODELS:
+            rings = found.name != ONE_SIDED
+            return self._best([(_TIME, self.time)], self._axes()) if rings else self._over_bend()
         signal = signal_of(get_effect(found.name))
         if signal is Signal.TIME:
-            return self._best([("time since the start of the run [s]", self.time)], self._axes())
+            return self._best([(_TIME, self.time)], self._axes())
         if signal is Signal.MOTION:
             return self._along_motion()
         if signal is Signal.GRAVITY:

@@ -9,6 +9,7 @@ import re
 
 from fastrod.effects.base import get_effect, trait
 from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.motion import DAMPING, INERTIA, Damping, Inertia
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import OneSidedTendons
 
@@ -47,6 +48,10 @@ _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
     "x nominal": ((0.0, 1.0, "× nominal"),),
     "": ((0.0, 100.0, "%"),),
 }
+
+
+BASE_MODELS: dict[str, type] = {ONE_SIDED: OneSidedTendons, INERTIA: Inertia, DAMPING: Damping}
+"""What a base model may lack besides effects, by name."""
 
 
 def friendly(unit: str, size: float) -> tuple[float, str]:
@@ -130,7 +135,7 @@ def plain_name(name: str) -> str:
 def law(name: str) -> dict[str, str]:
     """Equation, Symbols, Source and Residual signature of an effect, or of other tendons, from its
     docstring."""
-    what = OneSidedTendons if name == ONE_SIDED else type(get_effect(name))
+    what = BASE_MODELS.get(name) or type(get_effect(name))
     text = inspect.cleandoc(what.__doc__ or "")
     keys = "Equation|Symbols|Source|Residual signature"
     found = re.findall(rf"^({keys}): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE)

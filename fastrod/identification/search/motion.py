@@ -39,7 +39,12 @@ of a step's Newton method would show, 1e-6 of the bend."""
 HORIZONS = (0.06, 0.12, 0.25, 0.5, 1.0, 1.0)
 """Fractions of each run that are fitted one after the other: an oscillation that is off by half a period at
 the end of a run pulls its frequency to a neighbour."""
-_MOST = 48  # robots of a batch
+INERTIA, DAMPING = "inertia", "damping"
+"""What a model at rest lacks where a robot rings."""
+_FIRST = 0.56  # sqrt(EI / (m l^3)) of a rod that is clamped at one end: its first frequency [Hz]
+_FADES = 0.1  # of a radian of its first oscillation: damping time where the file has none
+_WIDE = 1.5  # relative sd of it
+_MOST = 160  # robots of a batch
 _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
 _ITERATIONS = 6
@@ -97,6 +102,27 @@ def _geometry(robot: Robot) -> tuple[object, ...]:
 def _with_effects(robot: Robot, names: Sequence[str]) -> Robot:
     tables = named_effects(robot)
     return replace(robot, effects=tuple({"name": name, **tables.get(name, {})} for name in names))
+
+
+class Inertia:
+    """The rod has inertia: it rings after its inputs have changed, or after it was let go.
+
+    Equation: rho A r_tt = n_s + f, d(rho I w)/dt = m_s + r_s x n, with the masses of lumps and payload
+    Symbols: rho A line_density, r position, n and m force and moment in the rod, f loads, w rate of rotation
+    Source: Till, Aloi and Rucker 2019, Real-time dynamics of soft and continuum robots
+    Residual signature: an oscillation that begins where inputs change or the tip is let go, and dies
+    """
+
+
+class Damping:
+    """The material resists the rate of its strain (Kelvin-Voigt), and so an oscillation dies.
+
+    Equation: m = EI (kappa + tau kappa_t), likewise torsion, stretch and shear
+    Symbols: tau damping_time, EI stiffness, kappa curvature
+    Source: Linn, Lang and Tuganov 2013, Geometrically exact Cosserat rods with Kelvin-Voigt type viscous
+    damping
+    Residual signature: without it the oscillation would go on
+    """
 
 
 class MotionModel:
@@ -220,11 +246,18 @@ class MotionSearch(Search):
             for name, model in models.items()
         }
         first = sorted(promise, key=lambda name: -promise[name])[:_FITTED]
-        worth = [name for name in first if promise[name] > _PROMISING * promise[first[0]]]
+        # of the loss: what the evidence asks of each number that a candidate adds
+        size = state.fit.residual.size
+        price = {name: (len(models[name].unknowns) - n) * np.log(size) / size for name in first}
+        worth = [
+            name
+            for name in first
+            if promise[name] > max(_PROMISING * promise[first[0]], price[name] * state.fit.loss)
+        ]
         return [
             super(MotionSearch, self).candidate(state, name)
             if name in worth
-            else unfitted(name, "it promises less than others", len(models[name].unknowns) - n)
+            else unfitted(name, "it promises too little", len(models[name].unknowns) - n)
             for name in names
         ]
 
@@ -294,6 +327,32 @@ def fit_motion(
     moved = MotionSearch(samples, whole, own, blocks, excluded, noise.sigma)
     search, state = moved.weighed(moved._state(model, moved._near(model, theta), fit, ()), noise.sigma)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=notes)
+
+
+def damped(robot: Robot) -> Robot:
+    """A robot whose damping is to be fitted, from what is usual where its file has none."""
+    mass = sum(s.line_density * s.length for s in robot.segments)
+    soft = min(min(s.bending_stiffness) for s in robot.segments)
+    usual = _FADES / (2.0 * np.pi * _FIRST * np.sqrt(soft / (mass * robot.length**3)))
+    segments = tuple(replace(s, damping_time=s.damping_time or float(usual)) for s in robot.segments)
+    target = "segment.*.damping_time"
+    middle = float(np.mean([s.damping_time for s in segments]))
+    return replace(
+        robot, segments=segments, fit={target: {"sd": _WIDE * middle, "shared": True}, **robot.fit}
+    )
+
+
+def undamped(state: ModelState) -> ModelState:
+    """The same without damping, nothing fitted again."""
+    segments = tuple(replace(s, damping_time=0.0) for s in state.model.robot.segments)
+    kept = [u.place[1] != "damping_time" for u in state.model.unknowns]
+    model = replace(
+        state.model,
+        robot=replace(state.model.robot, segments=segments),
+        unknowns=_those(state.model.unknowns, kept),
+    )
+    theta = state.theta[np.array(kept, dtype=bool)]
+    return replace(state, model=model, fit=replace(state.fit, theta=theta))
 
 
 def _steps(model: Model, theta: Floats) -> Floats:
