@@ -22,7 +22,7 @@ from fastrod.effects.pipeline import named_effects
 from fastrod.errors import LogError, RobotError
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose
-from fastrod.identification.log.motion import MotionReplay
+from fastrod.identification.log.motion import LONGEST_STEP, MotionReplay
 from fastrod.identification.log.noise import Noise, keep, read_noise
 from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.base import SEEN, BaseFit
@@ -47,7 +47,8 @@ _WIDE = 1.5  # relative sd of it
 _MOST = 160  # robots of a batch
 _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
-_ITERATIONS = 6
+_ITERATIONS, _TRIES, _REFINED = 5, 3, 3
+_QUICK = 2.0  # times the step of the fit, with which candidates are tried
 
 
 @dataclass(eq=False)
@@ -57,6 +58,9 @@ class MotionRod:
     samples: LogSamples
     points: bool = False
     threads: int | None = None
+    longest_step: float = LONGEST_STEP
+    fine: tuple[PredictedPose, PredictedPose] | None = None
+    """One robot at a finer step and at this one: what these differ by is added to every other robot's."""
     runs: int = 0
     """Batches moved so far."""
     cost: float = 0.0
@@ -68,10 +72,28 @@ class MotionRod:
         """What the camera sees of each of these robots."""
         new = {repr(robot): robot for robot in robots if repr(robot) not in self._known}
         for keys, batch in _batches(new):
-            replay = MotionReplay(self.samples, points=self.points, threads=self.threads)
-            self._known |= zip(keys, replay.poses(batch), strict=True)
+            replay = MotionReplay(
+                self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
+            )
+            self._known |= zip(keys, map(self._corrected, replay.poses(batch)), strict=True)
             self.runs += 1
         return [self._known[repr(robot)] for robot in robots]
+
+    def _corrected(self, pose: PredictedPose) -> PredictedPose:
+        if self.fine is None:
+            return pose
+        fine, here = self.fine
+        rotation = fine.rotation @ np.swapaxes(here.rotation, 1, 2) @ pose.rotation
+        off = fine.position - here.position, fine.points - here.points
+        return PredictedPose(pose.position + off[0], rotation, pose.points + off[1], pose.ok & fine.ok)
+
+    def coarse(self, robot: Robot, times: float) -> MotionRod:
+        """The same at a step so many `times` as long, right for this robot: that of others which are not far
+        from it is right but for how their own error of the step differs."""
+        quick = replace(self, longest_step=times * self.longest_step, fine=None, runs=0, _known={})
+        quick.fine = self.poses([robot])[0], quick.poses([robot])[0]
+        quick._known.clear()
+        return quick
 
 
 def _batches(robots: dict[str, Robot]) -> Iterator[tuple[list[str], list[Robot]]]:
@@ -192,7 +214,7 @@ class MotionModel:
         def slopes(theta: Floats, r: Floats) -> Floats:
             return self.slopes(model, theta, r, known)
 
-        return minimise(residual, slopes, start, *model.prior, model.limits, iterations)
+        return minimise(residual, slopes, start, *model.prior, model.limits, iterations, _TRIES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +239,15 @@ class MotionSearch(Search):
         fit = linearised.fit(state.model, state.theta, 3, state.fit.slopes / size)
         return search, search._state(state.model, linearised, fit, ())
 
+    def refined(self, state: ModelState, iterations: int = _REFINED, *, borrow: bool = False) -> ModelState:
+        """The state at the step of the fit, where it is not there yet; its slopes are good enough (`borrow`
+        or not)."""
+        if (borrow and not iterations) or cast(MotionModel, state.linearised).rod is self.rod:
+            return state
+        linearised = self._near(state.model, state.theta)
+        fit = linearised.fit(state.model, state.theta, iterations, state.fit.slopes)
+        return self._state(state.model, linearised, fit, ())
+
     def _near(self, model: Model, theta: Floats) -> LinearisedModel:
         return cast(LinearisedModel, MotionModel(model, theta, self.samples, self.rod, self.target))
 
@@ -240,7 +271,10 @@ class MotionSearch(Search):
                 thetas.append(start)
                 thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
             every += [model.identified(theta) for theta in thetas]
-        self.rod.poses(every)
+        quick = self.rod.coarse(state.model.identified(state.theta), _QUICK)
+        quick.poses(every)
+        near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
+        state = replace(state, linearised=cast(LinearisedModel, near))
         promise = {
             name: max(self._promise(state, model, theta) for theta in starts_of(state, model, name))
             for name, model in models.items()

@@ -108,8 +108,6 @@ class Search:
         """The same with the rod solved at the state's own parameters; with `borrow` its slopes are those of
         the last solution. A rod of modes is solved once more where the fit ends: no slope says where tendons
         go slack on the way."""
-        if self.in_motion:  # every fit is exact
-            return state
         linearised, theta = self._solved(state)
         if borrow:
             linearised = linearised.borrowing(state.linearised)

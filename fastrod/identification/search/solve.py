@@ -83,8 +83,10 @@ def minimise(
     sd: Floats,
     limits: tuple[Floats, Floats],
     iterations: int,
+    tries: int = 6,
 ) -> Fit:
-    """Levenberg-Marquardt inside `limits`, with normal priors. A step that leads to nan counts as worse."""
+    """Levenberg-Marquardt inside `limits`, with normal priors; a step is shortened so many `tries` times at
+    most. One that leads to nan counts as worse."""
     low, high = limits
     precision = 1.0 / sd**2
     theta = np.clip(start, low, high)
@@ -105,7 +107,7 @@ def minimise(
         held = ((theta <= low) & (gradient < 0.0)) | ((theta >= high) & (gradient > 0.0))
         free = ~held
         moved = False
-        for _ in range(6):
+        for _ in range(tries):
             step = np.zeros_like(theta)
             step[free] = _solve(H[np.ix_(free, free)] + damping * np.diag(np.diag(H)[free]), gradient[free])
             tried = np.clip(theta + step, low, high)
