@@ -19,11 +19,11 @@ from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
-from fastrod.identification.report.motion import named_inertia
+from fastrod.identification.report.motion import named
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
-from fastrod.identification.search.motion import damped, fit_motion
+from fastrod.identification.search.motion import DAMPING, INERTIA, damped, fit_motion
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
@@ -97,7 +97,9 @@ def identify(
     # refuses a wrong [fit] before anything is solved
     model = base_model(robot, free_camera=free_camera, dynamics=dynamics)
     if dynamics:
-        return _in_motion(log, robot, model, frozenset(exclude), max_effects, progressed, threads)
+        return _in_motion(
+            log, robot, model, free_camera, frozenset(exclude), max_effects, progressed, threads
+        )
     if max_effects and (found := _rings(log, robot, progressed, threads)):
         return found
     progressed("registration", 0, most)
@@ -164,7 +166,7 @@ def _rings(
 ) -> Result | None:
     """What the model at rest lacks of a robot with a mass that was let go: inertia and damping; None where it
     was not, or where these do not explain much."""
-    if log.swings is None or not all(s.line_density > 0.0 for s in robot.segments):
+    if log.swings is None:
         return None
     log = log.swings
     progressed("base fit", 0, 1)
@@ -175,32 +177,40 @@ def _rings(
     moving = fit_motion(log.samples.on(log.rows), base_model(moved, dynamics=True), moved, threads=threads)
     if moving.left > _LESS * still.left:
         return None
-    return named_inertia(_concluded(log, moving, _searched(moving, 0, progressed)), log, still, moving)
+    result = _concluded(log, moving, _searched(moving, 0, progressed))
+    return named(result, log, still, moving, (INERTIA, DAMPING))
 
 
 def _in_motion(
     log: SplitLog,
     robot: Robot,
     model: Model,
+    free_camera: bool,
     excluded: frozenset[str],
     max_effects: int,
     progressed: Callable[[str, int, int], None],
     threads: int | None,
 ) -> Result:
-    """What the model of `robot` in motion lacks."""
+    """What the model of `robot` in motion lacks: damping, where its file has none, then effects."""
     most, log = max_effects + _SPARE + 2, log.swings or log
-    base = fit_motion(
-        log.samples.on(log.rows),
-        model,
-        robot,
-        excluded,
-        threads=threads,
-        report=lambda what: progressed(what, 0, most),
-    )
+
+    def fitted(model: Model, robot: Robot) -> BaseFit:
+        def report(what: str) -> None:
+            progressed(what, 0, most)
+
+        return fit_motion(log.samples.on(log.rows), model, robot, excluded, threads=threads, report=report)
+
+    base, without = fitted(model, robot), None
+    if max_effects and not any(s.damping_time for s in robot.segments):
+        moved = damped(robot)
+        other = fitted(base_model(moved, free_camera=free_camera, dynamics=True), moved)
+        if other.left < _LESS * base.left:
+            base, without = other, base
     progressed(base.sentence, 0, most)
     outcome = _searched(base, max_effects, progressed)
     progressed("prediction on all samples", most - 1, most)
-    return _concluded(log, base, outcome)
+    result = _concluded(log, base, outcome)
+    return named(result, log, without, base, (DAMPING,)) if without else result
 
 
 def _found(

@@ -16,7 +16,7 @@ from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import sample
-from fastrod.identification.log.motion import MotionReplay
+from fastrod.identification.log.motion import MotionReplay, let_go
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog, write_log
@@ -34,6 +34,8 @@ ALL = {
     "segment.*.bending_stiffness": {"sd": 1e-6, "shared": True},
     "segment.*.torsional_stiffness": {"sd": 1e-6, "shared": True},
 }
+
+DAMPED = {"segment.1.damping_time": {"sd": 0.005}}
 
 
 def robot(
@@ -127,16 +129,76 @@ def test_held_out_error_falls_to_the_noise(found: Result) -> None:
 
 
 @pytest.mark.study
-def test_a_report_in_motion_says_what_was_not_tried() -> None:
-    """Backlash that nobody declared is left in the residual, and is not called explained."""
-    plant = robot(density=0.33, effects=({"name": "backlash", "half_width": 6e-4},))
-    log = recorded(plant, {"fitted": 1, "other": 2}, np.arange(100) * 0.01, NOISE, step=1e-3)
-    given = robot(fit={"segment.1.line_density": {"sd": 0.1}, "segment.1.damping_time": {"sd": 0.005}})
-    found = identify(log, given, held_out=["other"], dynamics=True)
-    assert found.verdict == "not_in_library"
-    assert found.effects == []
-    assert "no effect was tried" in found.summary
-    assert found.test.after > 2.0 * NOISE * np.sqrt(3.0)
+@pytest.mark.parametrize(
+    "law",
+    [{"name": "backlash", "half_width": 4e-4}, {"name": "latency", "delay": 0.03}],
+    ids=lambda law: law["name"],
+)
+def test_an_effect_that_nobody_declared_is_named_in_motion(law: dict[str, Any]) -> None:
+    """Beside inertia and damping, with its size, down to the noise on a run that no fit has seen."""
+    plant = robot(damping=0.006, effects=(law,))
+    log = recorded(plant, {"fitted": 1, "other": 2}, np.arange(100) * 0.01, NOISE)
+    found = identify(log, robot(fit=DAMPED), held_out=["other"], dynamics=True)
+    assert [effect.name for effect in found.effects][:1] == [law["name"]]
+    assert found.verdict == "explained"
+    assert found.test.after < 1.1 * NOISE * np.sqrt(3.0)
+    assert found.test.before > 3.0 * found.test.after
+    size = next(key for key in law if key != "name")
+    assert found.effects[0].parameters[size].value == pytest.approx(law[size], rel=0.05)
+
+
+@pytest.mark.study
+def test_damping_that_the_file_does_not_have_is_named() -> None:
+    log = recorded(robot(damping=0.006), {"fitted": 1, "other": 2}, np.arange(100) * 0.01, NOISE)
+    found = identify(log, robot(damping=0.0), held_out=["other"], dynamics=True)
+    assert [effect.name for effect in found.effects] == ["damping"]
+    assert found.verdict == "explained"
+    assert found.effects[0].parameters["segment.1.damping_time"].value == pytest.approx(0.006, rel=0.02)
+    assert found.test.before > 5.0 * found.test.after
+
+
+def let_it_go(damping: float, seconds: float) -> tuple[RunLog, Robot]:
+    """A rod without tendons, pulled aside by a force, held for 0.2 s and let go, twice; and that rod."""
+    (segment,) = robot(damping=damping).segments
+    bare = Robot(name="bare", segments=(replace(segment, tendons=(), mode="passive"),))
+    sim = Simulator(bare, n_robots=2, dt=1e-3, dynamics=True, points_per_segment=4)
+    sim.settle(tip_force=np.array([[0.15, 0.0, 0.0], [0.0, 0.25, 0.0]]))
+    held = sim.measure().tip_position
+    tips = [held] * 20
+    for k in range(round(1e3 * seconds)):
+        sim.step()
+        tips += [sim.measure().tip_position] if k % 10 == 9 else []
+    n, tip = len(tips), np.stack(tips, axis=1)
+    tip = tip + NOISE * np.random.default_rng(5).normal(size=tip.shape)
+    t, run = np.tile(0.01 * np.arange(n), 2), np.repeat(["a", "b"], n)
+    log = RunLog(name="released", t=t, run=run, dl=np.zeros((2 * n, 0)), tip_position=tip.reshape(-1, 3))
+    return log, bare
+
+
+@pytest.mark.study
+def test_inertia_and_damping_are_named_where_a_robot_was_let_go() -> None:
+    """From a file that has a mass and no damping, asked at rest: nothing is told of how it was held."""
+    log, bare = let_it_go(0.004, 1.5)
+    still = replace(bare, segments=(replace(bare.segments[0], damping_time=0.0),))
+    found = identify(log, still, held_out=["b"])
+    assert [effect.name for effect in found.effects] == ["inertia", "damping"]
+    assert found.effects[1].parameters["segment.*.damping_time"].unit in ("s", "x nominal")
+    assert found.identified.segments[0].damping_time == pytest.approx(0.004, rel=0.03)
+    assert found.test.before > 10.0 * found.test.after
+    assert found.test.after < 1.5 * NOISE * np.sqrt(3.0)
+
+
+def test_a_log_that_was_let_go_begins_where_it_turns_back() -> None:
+    log, _ = let_it_go(0.004, 1.5)
+    cut = let_go(log)
+    for run, axis in (("a", 0), ("b", 1)):
+        rows = log.run == run
+        begun = int(np.flatnonzero(np.isfinite(cut.t[rows]))[0])
+        x = log.tip_position[rows, axis]
+        assert begun > 20  # it was held for as long
+        assert x[begun] == pytest.approx(x.min(), abs=3.0 * NOISE)  # the other side
+    driven = recorded(robot(), {"a": 3}, np.arange(60) * 0.01, 0.0, step=1e-3)
+    assert let_go(driven) is driven
 
 
 def test_replay_in_motion_is_the_simulator() -> None:

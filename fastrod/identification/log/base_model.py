@@ -24,6 +24,7 @@ _POSITIVE = (
     "length",
     "bending_stiffness",
     "torsional_stiffness",
+    "line_density",
     "offset",
     "axial_stiffness",
     "shear_stiffness",

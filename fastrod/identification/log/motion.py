@@ -27,7 +27,7 @@ LONGEST_STEP = 1e-3
 """s. Generalized-alpha is second order; `identify` says what half of it would change."""
 _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
-_SWINGS = 10.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
+_SWINGS = 6.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
 _HELD = 0.1  # of the first displacement: a tip that has gone so far is no longer held
 _HOLDS = 6  # Newton steps to the force that holds the tip
 _STIFF = 0.02  # of the softest direction: along others nothing holds a tip

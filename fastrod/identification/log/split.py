@@ -36,8 +36,8 @@ class SplitLog:
     drives: Sequence[str] = ()
     """What its drives did of their commands, where they were measured, in sentences."""
     swings: SplitLog | None = None
-    """The same of runs that were let go from where they turn back, for a fit in motion; None where none
-    was."""
+    """The same of runs that were let go from where they turn back, for a fit in motion; None where none was,
+    or where the robot has no mass."""
 
 
 def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> SplitLog:
@@ -56,13 +56,15 @@ def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> Spli
             f"log {log.name!r} has no row in which every input is there; there is nothing to "
             "drive the model with."
         )
-    whole, cut = _cut(log, robot, held_out), let_go(log)
-    return whole if cut is log else replace(whole, swings=_cut(cut, robot, held_out))
+    cut = let_go(log)
+    swings = cut is not log and all(s.line_density > 0.0 for s in robot.segments)
+    whole = _cut(log, robot, held_out, swings)
+    return replace(whole, swings=_cut(cut, robot, held_out, swings)) if swings else whole
 
 
-def _cut(log: RunLog, robot: Robot, held_out: Sequence[str]) -> SplitLog:
+def _cut(log: RunLog, robot: Robot, held_out: Sequence[str], swings: bool) -> SplitLog:
     samples = sample(log)
-    check_log(samples, robot)
+    check_log(samples, robot, swings)
     tested, labels = held_out_rows(samples, held_out)
     rows = samples.rows[~tested[samples.rows]]
     if len(rows) < _LEAST_ROWS:
@@ -185,8 +187,9 @@ def held_out_rows(samples: LogSamples, held_out: Sequence[str]) -> tuple[Flags, 
     return mask, list(map(str, held_out))
 
 
-def check_log(samples: LogSamples, robot: Robot) -> None:
-    """A log that cannot tell anything is refused in a sentence."""
+def check_log(samples: LogSamples, robot: Robot, swings: bool = False) -> None:
+    """A log that cannot tell anything is refused in a sentence; one of a robot that `swings` tells something
+    without inputs."""
     log = samples.log
     measured = int(log.measured.sum())
     if measured == 0:
@@ -208,7 +211,7 @@ def check_log(samples: LogSamples, robot: Robot) -> None:
         ),
     ]
     moves = np.concatenate([np.ptp(a, axis=0) for a in inputs]) if inputs else np.zeros(0)
-    if not (moves > 1e-9).any():
+    if not (moves > 1e-9).any() and not swings:
         raise LogError(
             f"in log {log.name!r} no input ever changes; nothing can be learnt from it. fastrod "
             "excite writes a run that does."

@@ -28,6 +28,7 @@ FRACTION_GAIN = 0.2
 Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 # standard errors from a law that another one contains: nearer it is that law, further the richer one
 NEAR_SUB_LAW, FAR_FROM_SUB_LAW = 2.0, 3.0
+_MUCH = 300.0  # BIC by which a richer law is better, whatever its numbers: the contained one does not fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +181,7 @@ def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candid
             if sub.state.model.drive_of(name) != rich.state.model.drive_of(rich.name):
                 continue
             far = from_sub_law(rich.state, rich.name, where)
-            if far <= NEAR_SUB_LAW:
+            if far <= NEAR_SUB_LAW and advantage(rich, sub) < _MUCH:
                 kept = sub
             elif far >= FAR_FROM_SUB_LAW and rich.passes:
                 kept = rich

@@ -44,6 +44,7 @@ INERTIA, DAMPING = "inertia", "damping"
 _FIRST = 0.56  # sqrt(EI / (m l^3)) of a rod that is clamped at one end: its first frequency [Hz]
 _FADES = 0.1  # of a radian of its first oscillation: damping time where the file has none
 _WIDE = 1.5  # relative sd of it
+_GEOMETRY = ("length", "offset", "angle")
 _MOST = 160  # robots of a batch
 _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
@@ -121,6 +122,10 @@ def _geometry(robot: Robot) -> tuple[object, ...]:
     return tuple((s.length, tuple((t.offset, t.angle) for t in s.tendons)) for s in robot.segments)
 
 
+def _moves_geometry(model: Model) -> bool:
+    return any(u.place[0] == "robot" and u.place[1] in _GEOMETRY for u in model.unknowns)
+
+
 def _with_effects(robot: Robot, names: Sequence[str]) -> Robot:
     tables = named_effects(robot)
     return replace(robot, effects=tuple({"name": name, **tables.get(name, {})} for name in names))
@@ -188,7 +193,9 @@ class MotionModel:
         return found if pose.ok[self.target.weight > 0.0].all() else np.full_like(found, np.inf)
 
     def slopes(self, model: Model, theta: Floats, residual: Floats, known: Floats | None = None) -> Floats:
-        """(n, n_out, p) of the prediction, by differences; those by the first unknowns may be `known`."""
+        """(n, n_out, p) of the prediction, by differences; those by the first unknowns may be `known`, and
+        are taken from there where robots of different geometry would not move side by side."""
+        known = known if _moves_geometry(model) else None
         n_known = 0 if known is None else known.shape[-1]
         steps = _steps(model, theta)
         moved = (theta + np.diag(steps))[n_known:]
@@ -205,7 +212,7 @@ class MotionModel:
         unknowns may be `known`. A step and the slopes there are one batch."""
 
         def residual(theta: Floats) -> Floats:
-            first = 0 if known is None else known.shape[-1]
+            first = known.shape[-1] if known is not None and _moves_geometry(model) else 0
             moved = (theta + np.diag(_steps(model, theta)))[first:]
             with suppress(RobotError):  # a trial that is no robot is a worse one
                 self.rod.poses([model.identified(each) for each in (theta, *moved)])
