@@ -27,6 +27,7 @@ LONGEST_STEP = 1e-3
 """s. Generalized-alpha is second order; `identify` says what half of it would change."""
 _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
+_FEW = 20  # rows, of which no run is called let go
 _SWINGS = 6.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
 _HELD = 0.1  # of the first displacement: a tip that has gone so far is no longer held
 _HOLDS = 6  # Newton steps to the force that holds the tip
@@ -146,19 +147,28 @@ def let_go(log: RunLog) -> RunLog:
 
 def _turning_point(log: RunLog, rows: Ints) -> int | None:
     """Which of the rows of a run that is let go is the first at which the tip turns back; None where it is
-    driven, or rests."""
-    if len(rows) < 20 or not _is_still(log.rows(rows)):
+    driven, or does not come to rest."""
+    if len(rows) < _FEW or not _is_still(log.rows(rows)):
         return None
     tip = np.asarray(log.tip_position)[rows]
     off = tip - np.median(tip[-len(tip) // 10 :], axis=0)
     _, _, axes = np.linalg.svd(off, full_matrices=False)
     x = off @ axes[0]
-    if np.abs(x).max() < _SWINGS * max(float(x[-len(x) // 10 :].std()), 1e-12):
-        return None
+    far = np.abs(x) > _HELD * np.abs(x).max()
     begun = int(np.argmax(np.abs(x - x[0]) > _HELD * np.abs(x).max()))
-    turns = (np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & (np.abs(x[1:-1]) > _HELD * np.abs(x).max())
-    later = np.flatnonzero(turns[begun:])
-    return begun + 1 + int(later[0]) if len(later) else None
+    turns = np.flatnonzero((np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & far[1:-1])
+    later = turns[turns >= begun] + 1
+    swings = len(later) > 0 and _swings(tip[later[0] :]) is not None
+    return int(later[0]) if swings else None
+
+
+def _swings(tip: Floats) -> Floats | None:
+    """(3,) where a tip (n, 3) begins beside where it comes to rest [m]; None where it does not, or rests."""
+    if len(tip) < _FEW:
+        return None
+    end = tip[-len(tip) // 10 :]
+    off = np.asarray(tip[0] - np.median(end, axis=0))
+    return off if np.linalg.norm(off) > _SWINGS * np.linalg.norm(end.std(axis=0)) else None
 
 
 def _is_still(log: RunLog) -> bool:
@@ -173,12 +183,8 @@ def _beside_rest(samples: LogSamples, runs: Sequence[slice]) -> Floats:
     found = np.zeros((len(runs), 3))
     for k, span in enumerate(runs):
         log = samples.log.rows(span)
-        tip = np.asarray(log.tip_position)[log.measured]
-        if len(tip) >= 20 and _is_still(log):
-            end = tip[-len(tip) // 10 :]
-            off = tip[0] - np.median(end, axis=0)
-            if np.linalg.norm(off) > _SWINGS * np.linalg.norm(end.std(axis=0)):
-                found[k] = off
+        off = _swings(np.asarray(log.tip_position)[log.measured])
+        found[k] = off if off is not None and _is_still(log) else 0.0
     return found
 
 
