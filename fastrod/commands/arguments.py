@@ -146,7 +146,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     identify.add_argument(
         "--dynamics",
         action="store_true",
-        help="fit the robot's own parameters in motion; no effect is tried (needs line_density)",
+        help="fit and search in motion, with inertia and damping (needs line_density)",
     )
     identify.add_argument(
         "--network",

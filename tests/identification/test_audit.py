@@ -6,12 +6,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from identification.logs import bare_run, log_of, one_segment
+from identification.logs import bare_run, displacement_of, log_of, one_segment
 from numpy.testing import assert_allclose
 from rods import rod
 
 from fastrod.identification.log.forward import LogSamples, sample
-from fastrod.identification.search.residual_test import ResidualStructure, residual_structure
+from fastrod.identification.search.residual_test import (
+    ResidualStructure,
+    faster_than_commands,
+    residual_structure,
+)
 from fastrod.model.routing import route
 
 RATE, SIZE = 8.0, 0.9
@@ -120,3 +124,18 @@ def test_only_some_rows_and_a_robot_without_wires() -> None:
     assert residual_structure(passive, route(rod("passive")), noise(1)).kind == "none"
     drift = planted(patterns()["drift"], 0.5, 1)
     assert residual_structure(passive, route(rod("passive")), drift).kind == "drift"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.9])
+def test_what_is_faster_than_the_commands_is_told(share: float) -> None:
+    """Commands end at 0.4 Hz, and so does the rest of the residual."""
+    robot, dt, n = one_segment(), 0.05, 1200
+    t = dt * np.arange(n)
+    slow = np.sin(2.0 * np.pi * 0.2 * t) + np.cos(2.0 * np.pi * 0.4 * t)
+    dl = displacement_of(robot, 0.3 * np.stack([slow, 0.0 * slow], axis=1)[:, None])
+    swings = np.sqrt(2.0) * np.sin(2.0 * np.pi * 3.0 * t)
+    residual = np.sqrt(share) * swings + np.sqrt(1.0 - share) * slow
+    off = 1e-3 * residual[:, None] * [1.0, 0.5, 0.0]
+    found, ends = faster_than_commands(sample(log_of(robot, dl, dt)), off)
+    assert found == pytest.approx(share, abs=0.03)
+    assert ends == pytest.approx(0.4, abs=0.05)

@@ -22,7 +22,7 @@ from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, ch
 from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import BIC_STRONG, ModelState, SearchStep
-from fastrod.identification.search.residual_test import ResidualStructure
+from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
 from fastrod.identification.search.search import Search, SearchOutcome
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
@@ -50,6 +50,7 @@ _SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (
 _WORTH_SAYING = 0.03
 _NUMBERS_OF_TENDONS = {"compliance", "pretension", "axial_stiffness"}
 _RETURNS = 2.8  # of the noise: a command that comes back farther off does so by more than the noise
+_FAST = 0.2  # of the residual's square, above the commands' band
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
@@ -205,6 +206,12 @@ def assemble(
     said += _sign_of(base.without) if base.without else []
     said += _stand_ins(kept, final)
     said += _sentences(limits(robot, samples)) if say_limits else []
+    fast, band = faster_than_commands(samples, np.asarray(samples.log.tip_position) - after)
+    if say_limits and fast > _FAST:
+        said.append(
+            f"{100 * fast:.0f} % of what is left is faster than the commands, above {band:.2g} Hz: motion, "
+            "which no law at rest follows."
+        )
     revisits = [again.compare(tip) for tip in (before, after)]
     if at_rest and revisits[1] and revisits[1].elsewhere > _RETURNS * noise.floor:
         said += _sentences([revisits[1].sentence()])

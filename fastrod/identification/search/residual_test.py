@@ -25,6 +25,8 @@ _PLAYS = (0.03, 0.1, 0.25, 0.5)  # of the largest bend
 _LAGS = (0.3, 1.5, 6.0, 25.0)  # s
 _PIECES = 60  # blocks that the folds take in turn
 _RIDGES = (1.0, 30.0, 1000.0)
+_LONG_ENOUGH = 200  # samples of a run, whose spectrum tells something
+_BAND = 0.99  # of the commands' power
 _DRAWS = 30  # of noise that is alike from row to row
 
 
@@ -118,6 +120,31 @@ def residual_structure(
     return ResidualStructure(
         fractions[0], fractions[1], fractions[2], exogenous, float(max(z, beyond * np.sqrt(left.size)))
     )
+
+
+def faster_than_commands(samples: LogSamples, residual: Floats) -> tuple[float, float]:
+    """Share of the square of a residual (n, 3) of all samples above the band of the commands, and where that
+    ends [Hz]: no law at rest is faster than its inputs. 0 and nan where no run is long and even enough to
+    tell."""
+    above = whole = ends = 0.0
+    for span in samples.runs:
+        left, t = residual[span], samples.time[span]
+        good = np.isfinite(left).all(1)
+        if good.sum() < _LONG_ENOUGH or not good.any():
+            continue
+        dt = float(np.median(np.diff(t)))
+        even = np.arange(t[good][0], t[good][-1], dt)
+        columns = np.column_stack([left, np.asarray(samples.log.dl)[span]])
+        values = np.stack([np.interp(even, t[good], column[good]) for column in columns.T], axis=1)
+        window = np.hanning(len(even))[:, None]
+        power = np.abs(np.fft.rfft((values - values.mean(0)) * window, axis=0)) ** 2
+        told = power[:, 3:].sum(1).cumsum()
+        if not told[-1] > 0.0:
+            continue
+        k = int(np.searchsorted(told, _BAND * told[-1]))
+        above, whole = above + power[k + 1 :, :3].sum(), whole + power[:, :3].sum()
+        ends = max(ends, k / (dt * len(even)))
+    return (above / whole, ends) if whole > 0.0 else (0.0, float("nan"))
 
 
 class _Null:
