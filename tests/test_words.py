@@ -75,6 +75,7 @@ ALLOWED: dict[str, str] = {
     "device/fastrod_device/loop_report.py": "cannot_be_told_from",
     "fastrod/identification/report/assemble.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/headline.py": "cannot_be_told_from",
+    "fastrod/identification/report/motion.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/page.py": "evidence",
     "fastrod/identification/report/report.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/result.py": "cannot_be_told_from evidence",

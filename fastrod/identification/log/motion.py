@@ -156,8 +156,8 @@ def _turning_point(log: RunLog, rows: Ints) -> int | None:
     x = off @ axes[0]
     far = np.abs(x) > _HELD * np.abs(x).max()
     begun = int(np.argmax(np.abs(x - x[0]) > _HELD * np.abs(x).max()))
-    turns = np.flatnonzero((np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & far[1:-1])
-    later = turns[turns >= begun] + 1
+    reversals = np.flatnonzero((np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & far[1:-1])
+    later = reversals[reversals >= begun] + 1
     swings = len(later) > 0 and _swings(tip[later[0] :]) is not None
     return int(later[0]) if swings else None
 

@@ -9,7 +9,7 @@ import re
 
 from fastrod.effects.base import get_effect, trait
 from fastrod.identification.search.model_selection import Bound
-from fastrod.identification.search.motion import DAMPING, INERTIA, Damping, Inertia
+from fastrod.identification.search.motion import DAMPING, INERTIA, KelvinVoigtDamping, RodInertia
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import OneSidedTendons
 
@@ -50,7 +50,7 @@ _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
 }
 
 
-BASE_MODELS: dict[str, type] = {ONE_SIDED: OneSidedTendons, INERTIA: Inertia, DAMPING: Damping}
+BASE_MODELS: dict[str, type] = {ONE_SIDED: OneSidedTendons, INERTIA: RodInertia, DAMPING: KelvinVoigtDamping}
 """What a base model may lack besides effects, by name."""
 
 

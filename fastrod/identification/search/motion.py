@@ -131,7 +131,7 @@ def _with_effects(robot: Robot, names: Sequence[str]) -> Robot:
     return replace(robot, effects=tuple({"name": name, **tables.get(name, {})} for name in names))
 
 
-class Inertia:
+class RodInertia:
     """The rod has inertia: it rings after its inputs have changed, or after it was let go.
 
     Equation: rho A r_tt = n_s + f, d(rho I w)/dt = m_s + r_s x n, with the masses of lumps and payload
@@ -141,7 +141,7 @@ class Inertia:
     """
 
 
-class Damping:
+class KelvinVoigtDamping:
     """The material resists the rate of its strain (Kelvin-Voigt), and so an oscillation dies.
 
     Equation: m = EI (kappa + tau kappa_t), likewise torsion, stretch and shear

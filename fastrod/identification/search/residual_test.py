@@ -138,10 +138,10 @@ def faster_than_commands(samples: LogSamples, residual: Floats) -> tuple[float, 
         values = np.stack([np.interp(even, t[good], column[good]) for column in columns.T], axis=1)
         window = np.hanning(len(even))[:, None]
         power = np.abs(np.fft.rfft((values - values.mean(0)) * window, axis=0)) ** 2
-        told = power[:, 3:].sum(1).cumsum()
-        if not told[-1] > 0.0:
+        commanded = power[:, 3:].sum(1).cumsum()
+        if not commanded[-1] > 0.0:
             continue
-        k = int(np.searchsorted(told, _BAND * told[-1]))
+        k = int(np.searchsorted(commanded, _BAND * commanded[-1]))
         above, whole = above + power[k + 1 :, :3].sum(), whole + power[:, :3].sum()
         ends = max(ends, k / (dt * len(even)))
     return (above / whole, ends) if whole > 0.0 else (0.0, float("nan"))
