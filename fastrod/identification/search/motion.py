@@ -243,7 +243,7 @@ class MotionSearch(Search):
         size = max(rms(state.fit.residual), float((noise / before).max()))
         search = replace(self, target=self.target.weighed(before * size, noise))
         linearised = state.linearised.under(search.target)
-        fit = linearised.fit(state.model, state.theta, 3, state.fit.slopes / size)
+        fit = linearised.fit(state.model, state.theta, _ITERATIONS, state.fit.slopes / size)
         return search, search._state(state.model, linearised, fit, ())
 
     def refined(self, state: ModelState, iterations: int = _REFINED, *, borrow: bool = False) -> ModelState:
