@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ TENDON_UNITS = {
 """Those of a tendon."""
 ADDED = ("angle", "gain", "zero")
 """A shared one of these is the same number for all; of the others, the same factor."""
+_KEPT = 64  # robots of a model
 _WIDE = 5.0  # typical sizes: width of the prior of an effect's size
 
 
@@ -92,6 +94,17 @@ class Model:
     sessions: tuple[str, ...] = ("",)
     """Labels of the sessions: what is of one of them alone holds there in place of what is of the robot."""
 
+    @cached_property
+    def _given(self) -> dict[str, Floats]:
+        """Effect name -> (n_columns,) values that the robot has, or neutral."""
+        known = named_effects(self.robot)
+        return {name: read_values(name, known.get(name, {}), self.wiring, "robot") for name in self.effects}
+
+    @cached_property
+    def _robots(self) -> dict[tuple[float, ...], Robot]:
+        """Robots by the fitted numbers that are theirs, for effects change and they do not."""
+        return {}
+
     @property
     def start(self) -> Floats:
         """(p,) fitted numbers where a fit begins; of `log` unknowns the logarithms."""
@@ -141,8 +154,7 @@ class Model:
     def values(self, theta: Floats, session: int = 0) -> dict[str, Floats]:
         """Effect name -> (n_columns,) values in a session at the fitted numbers `theta` (p,); what is not
         unknown, as the robot has it or neutral."""
-        known = named_effects(self.robot)
-        values = {name: read_values(name, known.get(name, {}), self.wiring, "robot") for name in self.effects}
+        values = {name: own.copy() for name, own in self._given.items()}
         # what is of the robot comes first, and what is of the session in its place
         for unknown, number in sorted(zip(self.unknowns, theta, strict=True), key=lambda u: u[0].session):
             if unknown.place[0] == "effect" and unknown.session in (0, session):
@@ -160,11 +172,20 @@ class Model:
 
     def robot_at(self, theta: Floats) -> Robot:
         """The robot with the fitted numbers `theta` (p,), without its effects."""
-        robot = replace(self.robot, effects=())
-        for unknown, number in zip(self.unknowns, theta, strict=True):
-            if unknown.place[0] == "robot":
-                robot = _changed(robot, self.robot, unknown, unknown.inside(float(number)))
-        return _whole(robot, self.robot)
+        own = [
+            (unknown, float(number))
+            for unknown, number in zip(self.unknowns, theta, strict=True)
+            if unknown.place[0] == "robot"
+        ]
+        key = tuple(number for _, number in own)
+        if key not in self._robots:
+            robot = replace(self.robot, effects=())
+            for unknown, number in own:
+                robot = _changed(robot, self.robot, unknown, unknown.inside(number))
+            if len(self._robots) >= _KEPT:
+                self._robots.clear()
+            self._robots[key] = _whole(robot, self.robot)
+        return self._robots[key]
 
     def identified(self, theta: Floats, session: int = 0) -> Robot:
         """The robot with its effects in a session as tables; `[fit]` and `[sensor]` are left out, for what

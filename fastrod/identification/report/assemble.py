@@ -189,6 +189,12 @@ def assemble(
         if wiring.n_tendons
         else []
     )
+    revisits = [again.compare(tip) for tip in (before, after)]
+    if wiring.n_tendons and revisits[1] is None:
+        lacks.append(
+            "hardly a command comes twice: a static error cannot be distinguished from memory, by which the "
+            "same command leads elsewhere"
+        )
     recommended = [advice.look_at(pattern) for pattern in grounds.patterns]
     recommended += [
         advice.separating_run(e.name, other)
@@ -212,7 +218,6 @@ def assemble(
             f"{100 * fast:.0f} % of what is left is faster than the commands, above {band:.2g} Hz: motion, "
             "which no law at rest follows."
         )
-    revisits = [again.compare(tip) for tip in (before, after)]
     if at_rest and revisits[1] and revisits[1].elsewhere > _RETURNS * noise.floor:
         said += _sentences([revisits[1].sentence()])
     return Result(
