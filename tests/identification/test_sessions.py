@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 from identification.logs import displacement_of, log_of, one_segment, wave
 
+from fastrod.commands.cli import main
 from fastrod.errors import LogError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.forward import sample
 from fastrod.identification.log.replay import replay
+from fastrod.identification.report.report import write
 from fastrod.identification.search.solve import Estimate
 from fastrod.logs.drives import moved, sentences
 from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.model.robotfile import load_robot, save_robot
 
 NOISE, N, DT = 1e-4, 240, 0.05
 WORN = {"name": "backlash", "half_width": 4e-4}
@@ -129,3 +132,32 @@ def test_rows_without_a_position_are_not_driven_and_a_run_without_any_goes_by_it
     assert len(samples.log) == N - 1
     assert np.array_equal(samples.log.dl[-N // 2 :], log.dl[N // 2 :])
     assert np.abs(samples.log.dl[:50]).max() < 0.6 * np.abs(log.dl[:50]).max()
+
+
+@pytest.mark.study
+def test_another_day_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_robot(one_segment(effects=(WORN,)), tmp_path / "worn.toml")
+    write_log(logs()[1], tmp_path / "june.csv")
+    words = [
+        str(tmp_path / "june.csv"),
+        "--robot",
+        str(tmp_path / "worn.toml"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(["identify", *words, "--only-session", "--held-out", "june@6:"]) == 2  # its run has no name
+    assert main(["identify", *words, "--only-session", "--held-out", "@6:"]) == 0
+    assert "base fit" in capsys.readouterr().out
+    found = load_robot(tmp_path / "out" / "identified.toml")
+    names = {str(table["name"]) for table in found.effects}
+    assert names == {"latency", "encoder_offset", "backlash", "frame_misalignment"}
+
+
+@pytest.mark.study
+def test_each_day_has_its_own_robot_file(tmp_path: Path) -> None:
+    result = identify(logs(), one_segment(effects=(WORN,)), max_effects=0)
+    names = [path.name for path in write(result, tmp_path)]
+    assert names[-2:] == ["identified.toml", "identified_june.toml"]
+    june = load_robot(tmp_path / names[-1])
+    log = logs()[1]
+    assert replay(log, june).rms < 0.2 * replay(log, load_robot(tmp_path / names[-2])).rms
