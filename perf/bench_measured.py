@@ -20,7 +20,7 @@ from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from report import ROOT, SHARED, Row, Section, bench, note_progress, table
-from ring_down import REPEATS, compared
+from ring_down import REPEATS, WINDOW, compared, ring_of
 
 sys.path.append(str(ROOT / "scenes"))
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, ethz_beam, opencr_ftv4
@@ -157,7 +157,25 @@ def beam() -> list[Found]:
         swinging = log.only(*(f"{load}_{repeat}" for load in loads for repeat in "ab"))
         found = identify(swinging, robot, held_out=[f"{load}_b" for load in loads])
         rows.append(row(f"ETH beam let go, {' and '.join(loads)}", found))
+        rows[-1][1].extend(ringing(found, f"{load}_b") for load in loads)
     return rows
+
+
+def ringing(result: Result, run: str) -> str:
+    """How a run that no fit has seen rings, beside the model: frequency, and the decay of the amplitude over
+    the swings that both have within a second."""
+    rows = result.log.run == run
+    seen, made = (
+        ring_of(result.log.t[rows], tip[0, 0] - tip[:, 0], from_rest=True).until(WINDOW)
+        for tip in (result.log.tip_position[rows], result.after[rows])
+    )
+    n = min(len(seen.amplitude), len(made.amplitude)) - 1
+    lost = [float(np.log(ring.amplitude[0] / ring.amplitude[n])) for ring in (seen, made)]
+    return (
+        f"  {run}: rings at {made.frequency:.2f} Hz, measured {seen.frequency:.2f} "
+        f"({made.frequency / seen.frequency - 1.0:+.1%}); decay {lost[1]:.2f}, measured {lost[0]:.2f} "
+        f"({lost[1] / lost[0] - 1.0:+.1%})"
+    )
 
 
 def ring_down() -> Section:
