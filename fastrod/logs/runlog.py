@@ -80,7 +80,7 @@ class RunLog:
             "t": (n,),
             "run": (n,),
             "dl": (n, None),
-            "pos": self.dl.shape,
+            "pos": np.shape(self.dl),
             "session": (n,),
             "tip_position": (n, 3),
             "ext": (n, None),
