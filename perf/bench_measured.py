@@ -47,7 +47,7 @@ def row(name: str, result: Result) -> Found:
 def trunk() -> list[Found]:
     """0 g: fitted on 90 s, held out 60 s, moved by commands and by what its drives did of them. 100 g: the
     same robot with that mass, nothing fitted; then both fitted together. Two other sessions: zeros,
-    registration and delay fitted to their first half. Strokes and steps by themselves. The base model alone;
+    registration and delay alone. Strokes and steps by themselves. The base model alone;
     then a search, and one from a file that has six push-pull tendons on a body that cannot shorten."""
     given, robot = asl_trunk(DATA / "asl_trunk.csv")
     given = replace(given, points=None)  # the tip is what is judged, so the tip alone is fitted
@@ -60,9 +60,8 @@ def trunk() -> list[Found]:
     found[-1][1].append(f"  from the measured state: {segments(moved)}")
     others, _ = asl_trunk(DATA / "asl_trunk_sessions.csv")
     others = replace(others, points=None, pos=None)
-    for run, half in (("perlin_2_a", 37.5), ("hops_june_a", 15.0)):
-        own = others.only(run)
-        fitted = identify(own, light.identified, held_out=[f"{run}@{half}:"], only_session=True)
+    for run in ("perlin_2_a", "hops_june_a"):
+        fitted = identify(others.only(run), light.identified, only_session=True)
         found.append(row(f"trunk, {run}", fitted))
     runs = ("perlin_0g", "perlin_100g")
     both = identify(log.only(*runs), robot, held_out=[f"{run}@90:" for run in runs], max_effects=0)
