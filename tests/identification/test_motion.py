@@ -186,7 +186,7 @@ def test_inertia_and_damping_are_named_where_a_robot_was_let_go() -> None:
     assert damping.value == pytest.approx(0.01, rel=0.03)
     assert found.identified.segments[0].damping_time == damping.value
     assert found.test.before > 10.0 * found.test.after
-    assert found.test.after < 1.5 * NOISE * np.sqrt(3.0)
+    assert found.test.after < 2.0 * NOISE * np.sqrt(3.0)  # it starts from one noisy sample
 
 
 def test_a_log_that_was_let_go_begins_where_it_turns_back() -> None:
@@ -201,6 +201,10 @@ def test_a_log_that_was_let_go_begins_where_it_turns_back() -> None:
     n = len(log)
     driven = replace(log, dl=commands(1, log.t) + np.arange(n)[:, None] * 1e-6)
     assert let_go(driven) is driven
+    t = np.arange(200) * 0.01
+    tip = 0.05 * np.exp(-3.0 * t)[:, None] + NOISE * np.random.default_rng(1).normal(size=(200, 3))
+    creeps = RunLog(name="c", t=t, run=np.full(200, "a"), dl=np.zeros((200, 4)), tip_position=tip)
+    assert let_go(creeps) is creeps
 
 
 def test_replay_in_motion_is_the_simulator() -> None:

@@ -29,6 +29,7 @@ _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
 _FEW = 20  # rows, of which no run is called let go
 _SWINGS = 6.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
+_CROSSINGS = 2  # of the pose at rest, from which on a tip swings
 _HELD = 0.1  # of the first displacement: a tip that has gone so far is no longer held
 _HOLDS = 6  # Newton steps to the force that holds the tip
 _STIFF = 0.02  # of the softest direction: along others nothing holds a tip
@@ -158,7 +159,8 @@ def _turning_point(log: RunLog, rows: Ints) -> int | None:
     begun = int(np.argmax(np.abs(x - x[0]) > _HELD * np.abs(x).max()))
     reversals = np.flatnonzero((np.diff(x)[:-1] * np.diff(x)[1:] <= 0.0) & far[1:-1])
     later = reversals[reversals >= begun] + 1
-    swings = len(later) > 0 and _swings(tip[later[0] :]) is not None
+    crossings = int((np.diff(np.sign(x[begun:][far[begun:]])) != 0.0).sum())  # what creeps to rest has none
+    swings = crossings >= _CROSSINGS and len(later) > 0 and _swings(tip[later[0] :]) is not None
     return int(later[0]) if swings else None
 
 
