@@ -68,8 +68,8 @@ class Unknown:
     """Number of the session that it is of alone; 0: of the robot, and of the first session."""
 
     def inside(self, theta: float) -> float:
-        """The value of a fitted number."""
-        return math.exp(theta) if self.log else theta
+        """The value of a fitted number; never a rounding beyond its bounds."""
+        return min(max(math.exp(theta), self.bounds[0]), self.bounds[1]) if self.log else theta
 
     def outside(self, value: float) -> float:
         """The fitted number of a value."""

@@ -49,7 +49,8 @@ _MOST = 160  # robots of a batch
 _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
 _ITERATIONS, _TRIES, _REFINED = 5, 3, 3
-_QUICK = 2.0  # times the step of the fit, with which candidates are tried
+_SHORTER = (0.15, 0.3, 0.5, 0.7)  # of the times at which a fit begins at rest
+_QUICK = 2.0  # times the step of the fit, with which candidates are tried before the best are refined
 
 
 @dataclass(eq=False)
@@ -60,8 +61,6 @@ class MotionRod:
     points: bool = False
     threads: int | None = None
     longest_step: float = LONGEST_STEP
-    fine: tuple[PredictedPose, PredictedPose] | None = None
-    """One robot at a finer step and at this one: what these differ by is added to every other robot's."""
     runs: int = 0
     """Batches moved so far."""
     cost: float = 0.0
@@ -76,25 +75,9 @@ class MotionRod:
             replay = MotionReplay(
                 self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
             )
-            self._known |= zip(keys, map(self._corrected, replay.poses(batch)), strict=True)
+            self._known |= zip(keys, replay.poses(batch), strict=True)
             self.runs += 1
         return [self._known[repr(robot)] for robot in robots]
-
-    def _corrected(self, pose: PredictedPose) -> PredictedPose:
-        if self.fine is None:
-            return pose
-        fine, here = self.fine
-        rotation = fine.rotation @ np.swapaxes(here.rotation, 1, 2) @ pose.rotation
-        off = fine.position - here.position, fine.points - here.points
-        return PredictedPose(pose.position + off[0], rotation, pose.points + off[1], pose.ok & fine.ok)
-
-    def coarse(self, robot: Robot, times: float) -> MotionRod:
-        """The same at a step so many `times` as long, right for this robot: that of others which are not far
-        from it is right but for how their own error of the step differs."""
-        quick = replace(self, longest_step=times * self.longest_step, fine=None, runs=0, _known={})
-        quick.fine = self.poses([robot])[0], quick.poses([robot])[0]
-        quick._known.clear()
-        return quick
 
 
 def _batches(robots: dict[str, Robot]) -> Iterator[tuple[list[str], list[Robot]]]:
@@ -274,16 +257,16 @@ class MotionSearch(Search):
             at_zero[sizes] = [model.unknowns[j].mean for j in sizes]
             steps = np.diag([u.scale for u in model.unknowns])[sizes]
             thetas = [at_zero, *np.clip(at_zero + steps, *model.limits)]
-            for start in starts_of(state, model, name):
+            for start in _starts(state, model, name):
                 thetas.append(start)
                 thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
             every += [model.identified(theta) for theta in thetas]
-        quick = self.rod.coarse(state.model.identified(state.theta), _QUICK)
+        quick = MotionRod(self.samples, self.rod.points, self.rod.threads, _QUICK * self.rod.longest_step)
         quick.poses(every)
         near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
         state = replace(state, linearised=cast(LinearisedModel, near))
         promise = {
-            name: max(self._promise(state, model, theta) for theta in starts_of(state, model, name))
+            name: max(self._promise(state, model, theta) for theta in _starts(state, model, name))
             for name, model in models.items()
         }
         first = sorted(promise, key=lambda name: -promise[name])[:_FITTED]
@@ -308,10 +291,25 @@ class MotionSearch(Search):
         return found if np.isfinite(found) else 0.0
 
     def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
-        every = starts_of(state, model, name)
+        every = _starts(state, model, name)
         theta = max(every, key=lambda theta: self._promise(state, model, theta))
         known = state.fit.slopes[..., : len(state.model.unknowns)]
         return state.linearised.fit(model, theta, _ITERATIONS, known)
+
+
+def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
+    """Where fits begin: as at rest, and at shorter times, for a rod that rings has minima half a period
+    apart."""
+    every, n = starts_of(state, model, name), len(state.model.unknowns)
+    timed = [j for j, u in enumerate(model.unknowns) if j >= n and u.unit == "s"]
+    for start in every[:] if timed else []:
+        for part in _SHORTER:
+            shorter = start.copy()
+            for j in timed:
+                u = model.unknowns[j]
+                shorter[j] = np.clip(u.outside(part * u.inside(float(start[j]))), *u.limits)
+            every.append(shorter)
+    return every
 
 
 def fit_motion(
