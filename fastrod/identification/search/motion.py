@@ -48,7 +48,7 @@ _GEOMETRY = ("length", "offset", "angle")
 _MOST = 160  # robots of a batch
 _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
-_ITERATIONS, _TRIES, _REFINED = 5, 3, 3
+_ITERATIONS, _TRIES, _REFINED = 6, 6, 3
 _SHORTER = (0.15, 0.3, 0.5, 0.7)  # of the times at which a fit begins at rest
 _QUICK = 2.0  # times the step of the fit, with which candidates are tried before the best are refined
 
