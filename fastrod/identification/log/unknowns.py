@@ -68,8 +68,9 @@ class Unknown:
     """Number of the session that it is of alone; 0: of the robot, and of the first session."""
 
     def inside(self, theta: float) -> float:
-        """The value of a fitted number; never a rounding beyond its bounds."""
-        return min(max(math.exp(theta), self.bounds[0]), self.bounds[1]) if self.log else theta
+        """The value of a fitted number; a bound itself where only rounding leads beyond it."""
+        value = math.exp(theta) if self.log else theta
+        return next((edge for edge in self.bounds if math.isclose(value, edge, rel_tol=1e-12)), value)
 
     def outside(self, value: float) -> float:
         """The fitted number of a value."""
