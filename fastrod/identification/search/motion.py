@@ -303,11 +303,11 @@ def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
     every, n = starts_of(state, model, name), len(state.model.unknowns)
     timed = [j for j, u in enumerate(model.unknowns) if j >= n and u.unit == "s"]
     for start in every[:] if timed else []:
-        for part in _SHORTER:
+        for fraction in _SHORTER:
             shorter = start.copy()
             for j in timed:
                 u = model.unknowns[j]
-                shorter[j] = np.clip(u.outside(part * u.inside(float(start[j]))), *u.limits)
+                shorter[j] = np.clip(u.outside(fraction * u.inside(float(start[j]))), *u.limits)
             every.append(shorter)
     return every
 
