@@ -177,7 +177,7 @@ def let_it_go(damping: float, seconds: float) -> tuple[RunLog, Robot]:
 
 @pytest.mark.study
 def test_inertia_and_damping_are_named_where_a_robot_was_let_go() -> None:
-    """From a file that has a mass and no damping, asked at rest: nothing is told of how it was held."""
+    """From a file that has a mass and no damping, asked at rest: the log does not say how it was held."""
     log, bare = let_it_go(0.01, 2.0)
     still = replace(bare, segments=(replace(bare.segments[0], damping_time=0.0),))
     found = identify(log, still, held_out=["b"])

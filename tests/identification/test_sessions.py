@@ -1,4 +1,4 @@
-"""Robots on another day, and drives that do not do what they are told."""
+"""Robots on another day, and drives that do not follow their commands."""
 
 from __future__ import annotations
 
@@ -109,14 +109,16 @@ def test_a_robot_is_moved_by_what_its_drives_did_and_not_by_their_commands(gain:
     robot = one_segment()
     t = DT * np.arange(N)
     way = np.stack([np.sin(1.3 * t), np.cos(0.9 * t)], axis=1)[:, None]
-    told = displacement_of(robot, 0.6 * way)
+    commanded = displacement_of(robot, 0.6 * way)
     creeps = 0.1 * np.cos(0.21 * t)[:, None, None]
     done = displacement_of(robot, 0.6 * gain * way + creeps)
     late = np.stack([np.interp(t - 0.2, t, column) for column in done.T], axis=1)
     log = replay(log_of(robot, done, DT), robot)
-    measured = replace(log.log, dl=told, pos=late, tip_position=log.tip_position)
+    measured = replace(log.log, dl=commanded, pos=late, tip_position=log.tip_position)
     assert replay(measured, robot).rms < 0.2 * replay(replace(measured, pos=None), robot).rms
-    assert np.abs(moved(measured).dl - done)[10:-10].max() < 0.25 * np.abs(done - told)[10:-10].max() + 1e-4
+    assert (
+        np.abs(moved(measured).dl - done)[10:-10].max() < 0.25 * np.abs(done - commanded)[10:-10].max() + 1e-4
+    )
     (said,) = sentences(measured)
     lag, first = re.findall(r"(\d+) ms earlier|tendon 1 (\d\.\d+) of its command", said)
     assert float(lag[0]) == pytest.approx(200.0, abs=10.0)

@@ -247,7 +247,7 @@ class MotionSearch(Search):
         return [name for name in super().names(state) if not trait(get_effect(name), "feels_tip")]
 
     def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
-        """The candidates that promise most, fitted; of the others that they promise less."""
+        """The candidates that promise most, fitted; of the others, that they promise too little."""
         self.report("what each does")
         n, models = len(state.model.unknowns), {name: state.model.with_effect(name) for name in names}
         every: list[Robot] = []
