@@ -62,11 +62,34 @@ def quaternion_from_vector(vector: Floats) -> Floats:
     return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector], axis=-1)
 
 
+def vector_from_quaternion(quaternion: Floats) -> Floats:
+    """(..., 3) rotation vector [rad], no longer than pi, of a quaternion w x y z (..., 4)."""
+    turned = np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+    sine = np.linalg.norm(turned[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turned[..., :1])
+    return np.asarray(turned[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0))
+
+
+def rotation_between(before: Floats, after: Floats) -> Floats:
+    """(..., 3) rotation vector, world, from one set of quaternions (..., 4) to the next."""
+    return vector_from_quaternion(product(after, before * np.array([1.0, -1.0, -1.0, -1.0])))
+
+
+def displaced(pose: Floats, by: Floats) -> Floats:
+    """(..., 7) pose after a displacement and a rotation vector (..., 6), world."""
+    position = pose[..., :3] + by[..., :3]
+    return np.concatenate([position, product(quaternion_from_vector(by[..., 3:]), pose[..., 3:])], axis=-1)
+
+
+def displacement(start: Floats, end: Floats) -> Floats:
+    """(..., 6) displacement and rotation vector from one pose to another, world."""
+    turned = rotation_between(start[..., 3:], end[..., 3:])
+    return np.concatenate([end[..., :3] - start[..., :3], turned], axis=-1)
+
+
 def segment_bends(rotation: Floats, n_segments: int) -> Floats:
     """(n, n_segments, 2) integral of the curvature about d1 and d2 over each segment [rad], from
     world_from_material (n, n_points, 3, 3) at points that share the segments' length evenly."""
     turned = quaternion_from_matrix(np.swapaxes(rotation[:, :-1], -1, -2) @ rotation[:, 1:])
-    sine = np.linalg.norm(turned[..., 1:], axis=-1)
-    angle = 2.0 * np.arctan2(sine, turned[..., 0])
-    vectors = turned[..., 1:3] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[..., None]
+    vectors = vector_from_quaternion(turned)[..., :2]
     return np.asarray(vectors.reshape(len(rotation), n_segments, -1, 2).sum(2))

@@ -132,7 +132,8 @@ class Simulator(Motions):
 
     def __repr__(self) -> str:
         touched = "" if self.contact is None else ", ".join(self.contact.names) or "rods alone"
-        contact = f", contact with {touched}" if touched else ""
+        by = " by fcl" if self.contact is not None and self.contact.collision == "fcl" else ""
+        contact = f", contact with {touched}{by}" if touched else ""
         device = "" if self.device == "cpu" else f", device={self.device!r}"
         others = " and others" if any(robot is not self.robots[0] for robot in self.robots) else ""
         numbers = f"n_robots={self.n_robots}, dt={self.dt:g} s, n_points={self.n_points}"
@@ -159,6 +160,7 @@ class Simulator(Motions):
         derive: bool = False,
         passes: int = 1,
         estimate_error: bool = False,
+        inverse_inertia: ArrayLike | None = None,
     ) -> State:
         """One observer pass: one forward integration per robot. With rods of modes: the rest on these inputs,
         or with `dynamics` one step of `dt`, whose inputs are those at its end, by at least so many `passes`
@@ -189,6 +191,11 @@ class Simulator(Motions):
         pose has changed. Robots that touch something take as many passes as bring contact and boundary to
         rest; `state.contacts` reports them.
 
+        `inverse_inertia` (6, 6) or (n_robots, 6, 6), with `dynamics`: of the free body that carries the base,
+        its linear and angular acceleration by force and moment about the base point, world (J M^-1 J^T; 0 of
+        one that is held). `base_pose` is then where the body would be without the rod: it gives way within
+        the step, stably whatever the ratio of the masses, and what it felt is `state.mean_wrench`.
+
         `derive` says that `jacobian(turning=True)` will be asked for: a robot or two without contact and
         effects then get it from the same pass, at the shape of the state, at little cost.
         """
@@ -209,6 +216,7 @@ class Simulator(Motions):
         if self._felt is not None:
             return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
         self._spend(passes, estimate_error)
+        self._give_way(inverse_inertia)
         return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
 
     @named_inputs

@@ -150,10 +150,11 @@ class Surfaces(NamedTuple):
     their hierarchies' leaves."""
 
     primitive: Ints
-    """(n_obstacles, 2) addresses, in this process, of the compiled distance and curvature of a simple shape
-    (`kernels.contact.primitive`); 0 for a mesh."""
+    """(n_obstacles, 3) addresses, in this process, of the compiled distance and curvature of a simple shape
+    (`kernels.contact.primitive`), 0 for a mesh; and of a distance that stands for the search of a mesh, 0
+    where the kernels' own is meant."""
     size: Floats
-    """(n_obstacles, 3) of a simple shape [m]."""
+    """(n_obstacles, 3) of a simple shape [m]; a mesh's number for the distance that stands for its search."""
     sphere: Floats
     """(n_obstacles, 4) centre and radius of a ball that holds the obstacle; radius infinite for a plane
     [m]."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 import contact_batch as c
 from report import Row, Section, bench, goal, note_progress, table, thread_counts
 
@@ -43,6 +45,20 @@ def query_row(state: str, runs: list[c.Timed], fcl_s: float, n: int) -> Row:
     row: Row = {"state": state, "faces": one.n_faces, **{key: 1e6 * s for key, s in us.items()}}
     row |= {key: fcl_s / s for key, s in ratios.items()}
     return row | goal(fcl_s / warm_one, FCL_TARGET, least=True)
+
+
+def path_row(n: int, level: int) -> Row:
+    """Robots in contact with a mesh; FCL measures its distances inside the step, or the compiled search."""
+    batch, obstacle = c.make_batch(n), c.make_mesh(level)
+    note_progress(f"{n} robots by FCL, {len(obstacle.faces)} faces")
+    search, fcl = (c.run(batch, obstacle, c.PRESSED, ONE, 0.0, by) for by in ("bvh", "fcl"))
+    force, shape = (
+        float(np.abs(getattr(search.last, name) - getattr(fcl.last, name)).max())
+        for name in ("base_wrench", "position")
+    )
+    row: Row = {"robots": n, "faces": search.n_faces, "force": force, "shape": shape}
+    row |= {"bvh_us": 1e6 * search.step_s / n, "fcl_us": 1e6 * fcl.step_s / n}
+    return row | {"ratio": fcl.step_s / search.step_s, "not_ok": search.not_ok + fcl.not_ok}
 
 
 def growth_row(n: int, obstacle: Any, budget: float) -> Row:
@@ -101,6 +117,14 @@ def measure(options: Any) -> list[Section]:
             "ask once a pass.",
             "Search: candidates and smallest gap of every robot, tessellation and minima along the curve "
             "included. Met: the warm search, one thread against one.",
+        ),
+        table(
+            "contact_paths",
+            'The same contact by `collision="bvh"` and by `collision="fcl"`',
+            "robots:,d | faces:,d | bvh_us:,.0f bvh,~us / step | fcl_us:,.0f fcl,~us / step "
+            "| ratio:.1f fcl/bvh | force:.1e force~apart [N] | shape:.1e shape~apart [m] | not_ok:d not ok",
+            [path_row(count, level) for count in ((1, 2) if quick else (1, 16, 256)) for level in (3, 5)],
+            f"Five segments pressed on a ball, {ONE} thread: FCL is asked under the interpreter's lock.",
         ),
         table(
             "contact_growth",

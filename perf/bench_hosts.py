@@ -101,6 +101,55 @@ def engines(steps: int) -> list[Row]:
     return rows
 
 
+def falls(ratio: float, dt: float) -> Row:
+    """A body of 1 kg that falls for 0.2 s with a rod on it, by defaults; the same with a rod that feels a
+    body it does not touch; and a ball whose bent rod is let go, in no engine."""
+    import pairs
+
+    note_progress(f"a rod of {ratio:g} times its body's mass, {1e3 * dt:g} ms")
+    robot, n = pairs.heavy(ratio), round(0.2 / dt)
+    row: Row = {"ratio": ratio, "dt_ms": 1e3 * dt}
+    for engine in ("pybullet", "mujoco"):
+        for contact in (False, True):
+            rod, speed = pairs.falling(engine, robot, dt, contact)
+            for _ in range(n):
+                rod.step()
+            row[f"{engine}{'_felt' if contact else ''}"] = -speed() / (pairs.GRAVITY * n * dt)
+    bent = pairs.FreeBody(robot, 1.0 / ratio, dt, (0.0, 0.0, 0.0))
+    pull = 1e-3 * np.eye(len(robot.rest_tendon_length))[0]
+    bent.rod.settle(pairs.HOME, tendon_length=robot.rest_tendon_length - pull, gravity=np.zeros(3))
+    lost, size = np.zeros(6), np.zeros(6)
+    for _ in range(n):
+        bent.step(tendon_length=robot.rest_tendon_length)
+        both = bent.momentum()
+        lost, size = np.maximum(lost, np.abs(both.sum(0))), np.maximum(size, np.abs(both).max(0))
+    return row | {"linear": lost[:3].max() / size[:3].max(), "angular": lost[3:].max() / size[3:].max()}
+
+
+def coupled(steps: int) -> list[Row]:
+    """A step of a rod on a body that gives way, beside one on a base that moves as it is told."""
+    import pairs
+
+    rows = []
+    for name in ("prototype", "five_segment_reacher"):
+        robot = pairs.heavy(0.2, name)
+        pull, row = np.eye(len(robot.rest_tendon_length))[0], dict[str, Any](what=name)
+        for key, dynamics, mobility in (
+            ("static_ms", False, None),
+            ("told_ms", True, None),
+            ("gives_way_ms", True, np.diag([1.0] * 3 + [600.0] * 3)),
+        ):
+            rod = fastrod.Rod(robot, dt=DT, dynamics=dynamics)
+
+            def swing(k: int, rod: Any = rod, given: Any = mobility) -> Any:
+                length = robot.rest_tendon_length - 5e-4 * np.sin(0.05 * k) * pull  # noqa: B023
+                return rod.advance(pairs.HOME, np.zeros(6), DT, inverse_inertia=given, tendon_length=length)
+
+            row[key] = timed(f"{name}, {key}", swing, steps)["median_ms"]
+        rows.append(row | {"ratio": row["gives_way_ms"] / row["static_ms"]})
+    return rows
+
+
 def measure(options: Any) -> list[Section]:
     steps = 10 if options.quick else 200
     return [
@@ -112,6 +161,28 @@ def measure(options: Any) -> list[Section]:
             rods(steps) + paper(steps),
             f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world "
             "is in it. Warm.",
+        ),
+        table(
+            "pairs",
+            "A rod on a body that gives way",
+            "ratio:g rod~/ body | dt_ms:g dt~ms | pybullet:.5f falls at~g, PyBullet "
+            "| mujoco:.5f falls at~g, MuJoCo | pybullet_felt:.5f feels contact,~PyBullet "
+            "| mujoco_felt:.5f feels contact,~MuJoCo"
+            "| linear:.1e momentum~lost | angular:.1e angular~momentum lost",
+            [
+                falls(ratio, dt)
+                for ratio in ((0.05, 5.0) if options.quick else (0.05, 0.5, 1.0, 5.0))
+                for dt in (1e-3, 5e-3, 1e-2)
+            ],
+            "Lost: most over 0.2 s of the pair's, after its bent rod is let go, over the largest of either.",
+        ),
+        table(
+            "coupling",
+            "What it costs to give way",
+            "what | static_ms:.2f quasi-static~ms | told_ms:.2f in motion,~base as told "
+            "| gives_way_ms:.2f in motion,~gives way | ratio:.2f gives way~/ quasi-static",
+            coupled(steps),
+            "One thread, without an engine.",
         ),
         table(
             "engines",

@@ -103,11 +103,13 @@ class Timed:
     earlier: tuple[Any, ...]  # shape and clearance that the last step began from
 
 
-def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budget: float) -> Timed:
+def run(
+    batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budget: float, by: Any = "bvh"
+) -> Timed:
     """Bring the mesh to the robots, let them swing a little, then time steps: one cycle after the other
     while the `budget` of seconds lasts, three steps at least."""
     n, length = batch.tendon_length.shape[1], batch.tendon_length
-    scene = None if obstacle is None else ContactScene(obstacles=[obstacle])
+    scene = None if obstacle is None else ContactScene(obstacles=[obstacle], collision=by)
     sim = Simulator(load_robot(ROBOT), n, points_per_segment=POINTS, threads=threads, contact=scene)
     if obstacle is None:
         states = [sim.settle(length[0])]

@@ -76,7 +76,7 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
         block = world.createMultiBody(0.0, -1, -1, block_at().tolist(), **link)
         contact_bodies = [(block, 0)]
     base = BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER))
-    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0)
+    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0, dynamics=False)
     given = inputs(case)
     if case == CASES[3]:
         world.setJointMotorControl2(block, 0, world.VELOCITY_CONTROL, force=0.0)
@@ -113,7 +113,7 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     data = mujoco.MjData(model)
     MujocoArm(model, data).place(JOINTS)
     mount = {"position": (0.0, 0.0, ADAPTER), "contact_bodies": contact_bodies, "friction": 0.0}
-    rod = MujocoRod(robot, model, data, "tool0", **mount)
+    rod = MujocoRod(robot, model, data, "tool0", dynamics=False, **mount)
     given = inputs(case)
     return rod, lambda: rod.step(**given)
 

@@ -1,5 +1,5 @@
 """Closest points by FCL and by closed forms: one query at a time, exact, and no search shared with the fast
-path.
+path. With `ContactScene(collision="fcl")` the kernels of contact ask here for every distance to a mesh.
 
 FCL only names the closest face; distance and points then come from that face by a closed form. How FCL is
 asked follows from measurements against brute force (python-fcl 0.7):
@@ -20,17 +20,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numba import objmode
 
 from fastrod.contact.closest import Triple, along, lowest, on_triangle, segment_triangle
 from fastrod.contact.geometry import Obstacle
 from fastrod.contact.normals import pseudonormals
 from fastrod.contact.primitive import primitive_of
 from fastrod.errors import InputError
+from fastrod.kernels.contact.primitive import DISTANCE
+from fastrod.kernels.jit import pointed
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
 
@@ -87,6 +91,19 @@ class _Mesh:
         ]
         self.normals = pseudonormals(obstacle.vertices, obstacle.faces)
 
+    def at(self, p: Floats) -> tuple[float, Floats, Triple, int]:
+        """Signed distance of a point, its gradient, the closest point of the surface and its face, obstacle
+        frame."""
+        fcl = _fcl()
+        answer = fcl.DistanceResult()
+        dot = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(p * self.scale))
+        fcl.distance(self.body, dot, fcl.DistanceRequest(), answer)
+        face = int(answer.b1)
+        on_surface, feature = on_triangle(_triple(p), *self.corners[face])
+        away, outward = p - np.array(on_surface), self.normals[face, feature]
+        distance = math.copysign(math.hypot(*away), float(away @ outward))
+        return distance, away / distance if abs(distance) > _AT_SURFACE else outward, on_surface, face
+
     def face_near(self, p: Floats, q: Floats) -> int:
         """The face that FCL calls closest to the segment p-q, obstacle frame [m]."""
         fcl = _fcl()
@@ -115,6 +132,37 @@ def _bvh(vertices: Floats, faces: Any) -> Any:
     model.addSubModel(vertices, faces)
     model.endModel()
     return fcl.CollisionObject(model, fcl.Transform())
+
+
+_NUMBERED: list[_Mesh] = []
+
+
+def number_of(obstacle: Obstacle) -> int:
+    """By which kernels ask for the distance of a mesh."""
+    if obstacle not in _MESHES:
+        _MESHES[obstacle] = _Mesh(obstacle)
+    if (mesh := _MESHES[obstacle]) not in _NUMBERED:
+        _NUMBERED.append(mesh)
+    return _NUMBERED.index(mesh)
+
+
+def _ask(number: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Signed distance of a point in the frame of a mesh, and its gradient."""
+    mesh, p = _NUMBERED[int(number)], np.array([x, y, z])
+    distance, normal, _, _ = mesh.at(p)
+    return (distance, *normal.tolist())
+
+
+def _distance_by_fcl(size: Triple, p: Triple) -> tuple[float, Triple]:
+    with objmode(d="float64", x="float64", y="float64", z="float64"):
+        d, x, y, z = _ask(size[0], p[0], p[1], p[2])
+    return d, (x, y, z)
+
+
+@cache
+def address() -> int:
+    """Of the distance by FCL for kernels (`Surfaces.primitive`); `size[0]` is `number_of` the mesh."""
+    return pointed(_distance_by_fcl, DISTANCE, nogil=False)[1]
 
 
 class DirectScene:
@@ -162,17 +210,8 @@ class DirectScene:
             distance, gradient = primitive_of(obstacle.shape).plain(obstacle.size, _triple(local))
             normal = rotation @ np.array(gradient)
             return Closest(distance, normal, world - distance * normal, -1)
-        fcl = _fcl()
-        answer = fcl.DistanceResult()
-        dot = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(local * mesh.scale))
-        fcl.distance(mesh.body, dot, fcl.DistanceRequest(), answer)
-        face = int(answer.b1)
-        nearest, feature = on_triangle(_triple(local), *mesh.corners[face])
-        away = local - np.array(nearest)
-        outward = mesh.normals[face, feature]
-        distance = math.copysign(math.hypot(*away), float(away @ outward))
-        normal = rotation @ (away / distance if abs(distance) > _AT_SURFACE else outward)
-        return Closest(distance, normal, rotation @ np.array(nearest) + at, face)
+        distance, normal, on_surface, face = mesh.at(local)
+        return Closest(distance, rotation @ normal, rotation @ np.array(on_surface) + at, face)
 
     def segment(self, k: int, a: Sequence[float] | Floats, b: Sequence[float] | Floats) -> SegmentClosest:
         """Distance of the world segment from `a` to `b`, each (3,) [m], to obstacle `k`, and where that

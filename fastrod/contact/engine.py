@@ -9,7 +9,7 @@ import numpy as np
 from fastrod.contact.contacts import Contacts, contacts_of
 from fastrod.contact.frames import back_by, between, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.tree import addresses, pack
+from fastrod.contact.tree import pack
 from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
 from fastrod.kernels.batch import arrange, search_gaps, search_worlds
@@ -66,7 +66,7 @@ class Engine:
     ) -> None:
         n = len(rods.length)
         self.scene, self.rods, self.length, self.threads = scene, rods, length, threads
-        self.surfaces = pack(scene.obstacles)
+        self.surfaces = pack(scene.obstacles, scene.collision == "fcl")
         self.world = scene.world_of(n)
         self.poses_before = self.poses = scene.rest_poses()
         self.velocities: dict[int, Floats] = {}
@@ -93,7 +93,8 @@ class Engine:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take up what `pickle` or `copy` made: compiled shapes stand elsewhere in another process."""
         self.__dict__.update(state)
-        self.surfaces = self.surfaces._replace(primitive=addresses(self.scene.obstacles))
+        again = pack(self.scene.obstacles, self.scene.collision == "fcl")
+        self.surfaces = self.surfaces._replace(primitive=again.primitive, size=again.size)
 
     def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
         """`poses` (1 or n_robots, n_obstacles, 7) of the obstacles in this step, world. Those with a

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import InitVar, dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +50,10 @@ class ContactScene:
     max_iterations: int = 600
     """Iterations after which a step that cannot be solved is given up: fewer where many robots wait for one,
     as in training."""
+    collision: Literal["bvh", "fcl", "auto"] = "auto"
+    """Who measures distances to meshes, with the same loads: "bvh", a compiled search for batches; "fcl",
+    FCL, one query at a time; "auto" is the cheaper one, which is "bvh" from one robot on (`fastrod bench
+    contact`)."""
     max_passes: InitVar[int | None] = None
     """The old name of `max_iterations`, which is refused."""
 
@@ -90,6 +95,12 @@ class ContactScene:
                 f"ContactScene.max_iterations is {self.max_iterations!r}; it must be a whole number, at "
                 "least 20."
             )
+        if self.collision not in ("bvh", "fcl", "auto"):
+            raise InputError(
+                f"ContactScene.collision is {shown(self.collision)}; "
+                f"{nearest(str(self.collision), ('bvh', 'fcl', 'auto'))}"
+            )
+        object.__setattr__(self, "collision", "fcl" if self.collision == "fcl" else "bvh")
         if not 0.0 < self.watch <= 0.2:
             raise InputError(
                 f"ContactScene.watch is {self.watch!r}; it is a fraction of the rod's length, between 0 and "

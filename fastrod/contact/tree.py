@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from fastrod.contact import direct
 from fastrod.contact.geometry import Obstacle
 from fastrod.contact.normals import pseudonormals
 from fastrod.contact.primitive import primitive_of
@@ -17,8 +18,9 @@ from fastrod.types import Floats, Ints, Surfaces
 _LEAF = 4  # triangles at most
 
 
-def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
-    """The arrays that the kernels read; obstacle k of the list is row k."""
+def pack(obstacles: Sequence[Obstacle], by_fcl: bool = False) -> Surfaces:
+    """The arrays that the kernels read; obstacle k of the list is row k. With `by_fcl` FCL measures the
+    distances of meshes."""
     boxes, links, corners, normals, roots = (
         [np.zeros((0, 12))],
         [np.zeros((0, 2), np.int64)],
@@ -40,8 +42,8 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
         normals.append(normal)
         n_nodes, n_faces = n_nodes + len(box), n_faces + len(corner)
     return Surfaces(
-        primitive=addresses(obstacles),
-        size=np.array([o.size for o in obstacles], float).reshape(-1, 3),
+        primitive=addresses(obstacles, by_fcl),
+        size=np.array([_size(o, by_fcl) for o in obstacles], float).reshape(-1, 3),
         sphere=np.array([_ball(o) for o in obstacles], float).reshape(-1, 4),
         friction=np.array([o.friction for o in obstacles], float),
         compliance=np.array([1.0 / o.stiffness for o in obstacles], float),
@@ -55,15 +57,21 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
     )
 
 
-def addresses(obstacles: Sequence[Obstacle]) -> Ints:
-    """(n_obstacles, 2) `Surfaces.primitive` in this process. Raises `InputError` where a shape is none."""
-    found = np.zeros((len(obstacles), 2), np.int64)
+def addresses(obstacles: Sequence[Obstacle], by_fcl: bool = False) -> Ints:
+    """(n_obstacles, 3) `Surfaces.primitive` in this process. Raises `InputError` where a shape is none."""
+    found = np.zeros((len(obstacles), 3), np.int64)
     for row, o in zip(found, obstacles, strict=True):
         if o.shape != "mesh":
             primitive = primitive_of(o.shape)
             primitive.check(o.size)
-            row[:] = primitive.addresses
+            row[:2] = primitive.addresses
+        elif by_fcl:
+            row[2] = direct.address()
     return found
+
+
+def _size(o: Obstacle, by_fcl: bool) -> tuple[float, float, float]:
+    return (float(direct.number_of(o)), 0.0, 0.0) if by_fcl and o.shape == "mesh" else o.size
 
 
 def _ball(o: Obstacle) -> tuple[float, float, float, float]:

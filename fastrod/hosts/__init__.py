@@ -9,36 +9,21 @@ from typing import TYPE_CHECKING, Any
 from fastrod.hosts.host import Host, Motion
 
 if TYPE_CHECKING:
-    from fastrod.hosts.arm import BulletArm
-    from fastrod.hosts.bodies import RodBodies
-    from fastrod.hosts.bullet import Bullet, connect
-    from fastrod.hosts.camera import HostCamera
-    from fastrod.hosts.capsules import Capsules
-    from fastrod.hosts.link import BulletLink
-    from fastrod.hosts.mounted import MountedRod
-    from fastrod.hosts.mujoco import MujocoBody, MujocoRod, add_capsules
-    from fastrod.hosts.rod import Rod
-    from fastrod.hosts.softmanisim import SoftManiSim
-    from fastrod.hosts.visuals import Visuals
+    from fastrod.hosts.arm import BulletArm as BulletArm
+    from fastrod.hosts.bodies import RodBodies as RodBodies
+    from fastrod.hosts.bullet import Bullet as Bullet
+    from fastrod.hosts.bullet import connect as connect
+    from fastrod.hosts.camera import HostCamera as HostCamera
+    from fastrod.hosts.capsules import Capsules as Capsules
+    from fastrod.hosts.link import BulletLink as BulletLink
+    from fastrod.hosts.mounted import MountedRod as MountedRod
+    from fastrod.hosts.mujoco import MujocoBody as MujocoBody
+    from fastrod.hosts.mujoco import MujocoRod as MujocoRod
+    from fastrod.hosts.mujoco import add_capsules as add_capsules
+    from fastrod.hosts.rod import Rod as Rod
+    from fastrod.hosts.softmanisim import SoftManiSim as SoftManiSim
+    from fastrod.hosts.visuals import Visuals as Visuals
 
-__all__ = [
-    "Bullet",
-    "BulletArm",
-    "BulletLink",
-    "Capsules",
-    "Host",
-    "HostCamera",
-    "Motion",
-    "MountedRod",
-    "MujocoBody",
-    "MujocoRod",
-    "Rod",
-    "RodBodies",
-    "SoftManiSim",
-    "Visuals",
-    "add_capsules",
-    "connect",
-]
 _HOME = {
     "Bullet": "bullet",
     "BulletArm": "arm",
@@ -55,6 +40,8 @@ _HOME = {
     "add_capsules": "mujoco",
     "connect": "bullet",
 }
+
+__all__ = ["Host", "Motion", *_HOME]
 
 
 def __getattr__(name: str) -> Any:

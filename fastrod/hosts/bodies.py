@@ -9,8 +9,9 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.capsules import chords, rotation_between
+from fastrod.hosts.capsules import chords
 from fastrod.hosts.link import to_xyzw
+from fastrod.rotation import rotation_between
 from fastrod.types import Floats
 
 

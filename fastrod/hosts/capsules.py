@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
+from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix, rotation_between
 from fastrod.types import Floats
 
 
@@ -64,12 +64,3 @@ def moved(before: Capsules, after: Capsules, time: float) -> Capsules:
             [linear, rotation_between(before.quaternion, after.quaternion) / time], axis=-1
         )
     )
-
-
-def rotation_between(before: Floats, after: Floats) -> Floats:
-    """(..., 3) rotation vector, world, from one set of quaternions (..., 4) to the next."""
-    relative = product(after, before * [1.0, -1.0, -1.0, -1.0])
-    relative = np.where(relative[..., :1] < 0.0, -relative, relative)
-    size = np.linalg.norm(relative[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, relative[..., :1])
-    return np.asarray(np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0) * relative[..., 1:])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import os
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, ParamSpec, TypeVar, final
+from collections.abc import Sequence
+from typing import Any, final
 
 import numpy as np
 
@@ -19,9 +21,6 @@ from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
 
 class CarriedRod(ABC):
     """One rod on one body of an engine, coupled in both directions: the body's motion moves the rod's base,
@@ -30,6 +29,10 @@ class CarriedRod(ABC):
     Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the
     body is pushed with it. Any other body meets the rod's capsules. The rod's weight is that in the gravity
     of the world at each step.
+
+    Rod and body move together within the step, at any ratio of their masses. A rod whose every segment has a
+    line_density moves with inertia; one that feels contact has, for the body, that of its shape as a rigid
+    body; one without density has neither mass nor weight, and a line on stderr says so.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
     each.
@@ -72,20 +75,8 @@ class CarriedRod(ABC):
         """One step of the engine."""
 
     @abstractmethod
-    def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        """`inputs` with what the engine's own contacts add to them."""
-
-    @abstractmethod
-    def _accepted(self, inputs: dict[str, Any]) -> None:
-        """`inputs` of a call that was not refused: from now on they are those that stay."""
-
-    @abstractmethod
-    def _arrived(self) -> None:
-        """After the engine's step."""
-
-    @abstractmethod
-    def _forget(self) -> None:
-        """Remove the rod's forces that the engine still has."""
+    def _release(self) -> None:
+        """After the engine's step: remove the rod's forces that the engine still has."""
 
     @final
     @property
@@ -97,8 +88,7 @@ class CarriedRod(ABC):
     def settle(self, **inputs: Any) -> State:
         """Settle the rod where its host is now; inputs as for `step`. The host feels nothing yet."""
         inputs = _checked(inputs)
-        self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **self._loads(inputs))
-        self._accepted(inputs)
+        self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **inputs)
         self._place()
         return self.state
 
@@ -126,24 +116,30 @@ class CarriedRod(ABC):
         """
         self._look()
         inputs = _checked(inputs)
-        if self.state is None:
-            self.settle(**inputs)
-        motion = self._host.motion()
+        begins = self.state is None
+        motion, freedom = self._host.motion(), self._host.freedom(self.dt)
         state = self.state = self.rod.advance(
-            motion.pose, motion.velocity, self.dt, **self._scene(), **self._loads(inputs)
+            motion.pose,
+            motion.velocity,
+            self.dt,
+            inverse_inertia=freedom.inverse_inertia,
+            free_twist=freedom.twist,
+            **self._scene(),
+            **inputs,
         )
-        self._accepted(inputs)
         if state.ok[0]:
-            self.wrench = state.base_wrench[0].copy()
+            self.wrench = self.rod.wrench
             for contact in self.body_contacts:
                 more, point = contact.push(state)
                 self.wrench[:3] -= more[:3]
-                self.wrench[3:] -= more[3:] + np.cross(point - self.rod.base[:3], more[:3])
+                self.wrench[3:] -= more[3:] + np.cross(point - motion.pose[:3], more[:3])
         else:
             self.wrench = 0.5 * self.wrench
             for contact in self.body_contacts:
                 contact.push_half()
         self._host.exert(self.wrench)
+        if begins:
+            self._place()
         self._head_for()
         return state
 
@@ -152,7 +148,7 @@ class CarriedRod(ABC):
         """After the world's step: the capsules stand where the rod is."""
         if self.state is None:
             raise HostError("end() comes after begin() and the world's step.")
-        self._arrived()
+        self._release()
         self._place()
 
     @final
@@ -161,7 +157,7 @@ class CarriedRod(ABC):
         somewhere else. The next step settles where the host then is."""
         self.rod.reset()
         self.state, self.wrench = None, np.zeros(6)
-        self._forget()
+        self._release()
         for contact in self.body_contacts:
             contact.forget()
 
@@ -189,10 +185,15 @@ def rod_of(
     max_contacts: int,
     points_per_segment: int,
     capsules_per_segment: int,
-    dynamics: bool = False,
+    dynamics: bool | None,
 ) -> Rod:
     """Build the rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
-    scene = None
+    scene, densities = None, [segment.line_density for segment in robot.segments]
+    if dynamics is None:
+        by_energy = all(segment.mode != "paper" for segment in robot.segments)
+        dynamics = not body_contacts and by_energy and min(densities) > 0.0
+    if not any(densities):
+        note_massless(robot.name)
     if body_contacts:
         scene = ContactScene(
             obstacles=[shape.obstacle for body in body_contacts for shape in body.shapes],
@@ -208,6 +209,16 @@ def rod_of(
     )
 
 
+@functools.cache
+def note_massless(name: str) -> None:
+    """Say so on stderr, once for each robot, unless `FASTROD_QUIET` is set."""
+    if not os.environ.get("FASTROD_QUIET"):
+        print(
+            f"The robot {name!r} has no line_density: mounted, it has neither mass nor weight.",
+            file=sys.stderr,
+        )
+
+
 def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:
     """Raises `HostError` where a robot with weight states another gravity than this (3,) of its host's world;
     `how` says how that is changed."""
@@ -218,21 +229,6 @@ def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:
             f"robot {robot.name!r} states gravity {own} m/s^2, and the world of its host has {there}; "
             f"a mounted rod feels its host's: leave [world] gravity out of the robot file, or {how}."
         )
-
-
-def refuse_old_names(**now: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Make a function refuse keywords by their old names, with `HostError` and the name they have `now`."""
-
-    def wrap(function: Callable[P, T]) -> Callable[P, T]:
-        @functools.wraps(function)
-        def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-            for old in now.keys() & kwargs.keys():
-                raise HostError(f"{old} is now {now[old]}; give {now[old]}=... instead.")
-            return function(*args, **kwargs)
-
-        return checked
-
-    return wrap
 
 
 def check_bodies(contact_bodies: object) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.link import to_xyzw
+from fastrod.rotation import rotation_between
 from fastrod.types import Floats
 
 CONTACT_DISTANCE = 1e-3

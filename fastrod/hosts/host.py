@@ -1,10 +1,10 @@
-"""`Host`: what carries a rod's base."""
+"""`Host`: what carries a rod's base, how it moves, and how it gives way."""
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from fastrod.rotation import product, quaternion_from_vector
+from fastrod.rotation import displaced
 from fastrod.types import Floats
 
 
@@ -18,10 +18,17 @@ class Motion(NamedTuple):
 
     def after(self, time: float) -> Floats:
         """(7,) pose after this time [s] at constant velocity."""
-        pose = self.pose.copy()
-        pose[..., :3] += time * self.velocity[..., :3]
-        pose[..., 3:] = product(quaternion_from_vector(time * self.velocity[..., 3:]), pose[..., 3:])
-        return pose
+        return displaced(self.pose, time * self.velocity)
+
+
+class Freedom(NamedTuple):
+    """How a body gives way to a rod within a step; several bodies have an axis before."""
+
+    inverse_inertia: Floats
+    """(6, 6) J M^-1 J^T: linear and angular acceleration of the base by force and moment there, world; 0 of
+    what is held."""
+    twist: Floats
+    """(6,) mean velocity of the base over the step if there were no rod, world."""
 
 
 class Host(Protocol):
@@ -29,6 +36,9 @@ class Host(Protocol):
 
     def motion(self) -> Motion:
         """Of the rod's base: origin at the first node, z along the rod."""
+
+    def freedom(self, dt: float) -> Freedom:
+        """In the host's next step, of `dt` [s]."""
 
     def exert(self, wrench: Floats) -> None:
         """Feel (6,) force [N] and moment about the base point [N m], world, during the host's next step."""

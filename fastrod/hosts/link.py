@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.host import Motion
+from fastrod.hosts.host import Freedom, Motion
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -56,6 +56,45 @@ class BulletLink:
         velocity[:3] += np.cross(velocity[3:], arm)
         return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
 
+    def freedom(self, dt: float) -> Freedom:
+        """By the masses alone, whatever motors and contacts hold: a base that gives way more than it does is
+        the stable side, and one that is held feels the rod all the same. Of accelerations PyBullet tells
+        none: a body that flies has gravity's, others are taken to go on as they move."""
+        bullet, motion = self.bullet, self.motion()
+        point, velocity = motion.pose[:3], motion.velocity.copy()
+        n = bullet.getNumJoints(self.body)
+        joints = [j for j in range(n) if bullet.getJointInfo(self.body, j)[2] != bullet.JOINT_FIXED]
+        heavy = bullet.getDynamicsInfo(self.body, -1)[0] > 0.0
+        if not heavy and joints and self.link >= 0:
+            return Freedom(self._by_joints(joints), velocity)
+        if not heavy:
+            return Freedom(np.zeros((6, 6)), velocity)
+        if not joints:
+            velocity[:3] += dt * bullet.gravity
+        return Freedom(self._alone(point), velocity)
+
+    def _by_joints(self, joints: list[int]) -> Floats:
+        """J M^-1 J^T of a body that stands."""
+        bullet, zeros = self.bullet, [0.0] * len(joints)
+        q = [state[0] for state in bullet.getJointStates(self.body, joints)]
+        # its point is in the link's URDF frame, though PyBullet's guide has that of the centre of mass
+        slopes = bullet.calculateJacobian(self.body, self.link, self._position.tolist(), q, zeros, zeros)
+        jacobian = np.concatenate(slopes)
+        return jacobian @ np.linalg.solve(np.array(bullet.calculateMassMatrix(self.body, q)), jacobian.T)
+
+    def _alone(self, point: Floats) -> Floats:
+        """Of the link, or the nearest before it that has a mass, as if nothing were joined to it."""
+        bullet, link = self.bullet, self.link
+        while link >= 0 and bullet.getDynamicsInfo(self.body, link)[0] == 0.0:
+            link = bullet.getJointInfo(self.body, link)[16]
+        mass, _, inertia = bullet.getDynamicsInfo(self.body, link)[:3]
+        pose = com_motion(bullet, self.body, link).pose
+        rotation = matrix_from_quaternion(pose[None, 3:])[0]
+        turn = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
+        across = np.cross(np.eye(3), point - pose[:3])  # [arm]x
+        by_force = np.eye(3) / mass - across @ turn @ across
+        return np.block([[by_force, -across @ turn], [turn @ across, turn]])
+
     def exert(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the base point [N m], world, during the next stepSimulation."""
         point = self.motion().pose[:3]
@@ -64,20 +103,24 @@ class BulletLink:
 
 def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
     """Of a link's URDF frame."""
+    pose, velocity = com_motion(bullet, body, link)
+    inertial = bullet.getDynamicsInfo(body, link)
+    # com_from_frame, for bodies whose mass is off their origin
+    back = bullet.invertTransform(inertial[3], inertial[4])
+    position, quaternion = bullet.multiplyTransforms(pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), *back)
+    velocity[:3] += np.cross(velocity[3:], np.subtract(position, pose[:3]))
+    return Motion(np.array([*position, *from_xyzw(quaternion)]), velocity)
+
+
+def com_motion(bullet: Bullet, body: int, link: int) -> Motion:
+    """Of the frame of a link's centre of mass."""
     if link < 0:
-        com, orientation = bullet.getBasePositionAndOrientation(body)
+        position, quaternion = bullet.getBasePositionAndOrientation(body)
         linear, angular = bullet.getBaseVelocity(body)
-        inertial = bullet.getDynamicsInfo(body, -1)
-        # com_from_frame, for bodies whose mass is off their origin
-        back = bullet.invertTransform(inertial[3], inertial[4])
-        position, quaternion = bullet.multiplyTransforms(com, orientation, *back)
     else:
         state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
-        com, position, quaternion, linear, angular = state[0], state[4], state[5], state[6], state[7]
-    velocity = np.array([*linear, *angular])
-    # PyBullet's velocity is that of the centre of mass
-    velocity[:3] += np.cross(velocity[3:], np.subtract(position, com))
-    return Motion(np.array([*position, *from_xyzw(quaternion)]), velocity)
+        position, quaternion, linear, angular = state[0], state[1], state[6], state[7]
+    return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
 
 
 def exert(bullet: Bullet, body: int, link: int, wrench: Floats, point: Floats) -> None:

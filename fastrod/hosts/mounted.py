@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.carried import (
-    CarriedRod,
-    check_bodies,
-    check_contact,
-    check_gravity,
-    refuse_old_names,
-    rod_of,
-)
+from fastrod.hosts.carried import CarriedRod, check_bodies, check_contact, check_gravity, rod_of
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.rod import check_robot
 from fastrod.hosts.surroundings import BulletBodyContact
@@ -30,7 +23,6 @@ class MountedRod(CarriedRod):
     the rod's capsules, which push them at their speed and feel nothing.
     """
 
-    @refuse_old_names(touch="contact_bodies")
     def __init__(
         self,
         robot: Robot,
@@ -42,14 +34,14 @@ class MountedRod(CarriedRod):
         points_per_segment: int = 10,
         capsules_per_segment: int = 10,
         max_contacts: int = 16,
-        dynamics: bool = False,
+        dynamics: bool | None = None,
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
         head_color: Sequence[float] | None = None,
     ) -> None:
         """`contact_bodies`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on
-        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). With `dynamics`
-        the link feels the rod's inertia as well (without `contact_bodies`). The time step is the world's.
-        Raises `HostError`, `InputError`."""
+        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `dynamics`: the
+        rod moves with inertia; left out, where it can (`CarriedRod`). The time step is the world's. Raises
+        `HostError`, `InputError`."""
         if not isinstance(host, BulletLink):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
@@ -113,17 +105,8 @@ class MountedRod(CarriedRod):
     def _step_engine(self) -> None:
         self.bullet.stepSimulation()
 
-    def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        return inputs
-
-    def _accepted(self, inputs: dict[str, Any]) -> None:
-        """The rod keeps them itself."""
-
-    def _arrived(self) -> None:
+    def _release(self) -> None:
         """PyBullet forgets its external forces by itself."""
-
-    def _forget(self) -> None:
-        """Forget nothing: PyBullet forgets its external forces by itself."""
 
     def _nodes(self) -> tuple[Floats, Floats]:
         state = self.rod.state

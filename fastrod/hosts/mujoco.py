@@ -11,17 +11,10 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.carried import (
-    CarriedRod,
-    check_bodies,
-    check_contact,
-    check_gravity,
-    refuse_old_names,
-    rod_of,
-)
+from fastrod.hosts.carried import CarriedRod, check_bodies, check_contact, check_gravity, rod_of
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
 from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
-from fastrod.hosts.mujoco_contacts import ContactFeedback, Felt, read
+from fastrod.hosts.mujoco_contacts import Felt, read
 from fastrod.hosts.rod import check_robot
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
@@ -29,7 +22,6 @@ from fastrod.types import Floats
 __all__ = ["MujocoBody", "MujocoRod", "add_capsules"]
 
 
-@refuse_old_names(touch="contact_bodies")
 def add_capsules(
     spec: Any,
     robot: Robot,
@@ -106,11 +98,10 @@ class MujocoRod(CarriedRod):
     at their speed some hundredths of a second behind, and is held by friction as if by a thing that stands
     still. What the rod feels, and pushes at the right speed, are bodies in `contact_bodies`.
 
-    Bodies that are not in `contact_bodies` meet the capsules, and `felt` reports the forces. With `feel`
-    these forces bend the rod too.
+    Bodies that are not in `contact_bodies` meet the capsules, and `felt` reports the forces; they do not bend
+    the rod.
     """
 
-    @refuse_old_names(touch="contact_bodies")
     def __init__(
         self,
         robot: Robot,
@@ -123,17 +114,16 @@ class MujocoRod(CarriedRod):
         contact_bodies: Sequence[int | str] = (),
         friction: float = 0.3,
         relaxation: float = 0.1,
-        feel: bool = False,
         name: str = "rod",
         points_per_segment: int = 10,
         max_contacts: int = 16,
-        dynamics: bool = False,
+        dynamics: bool | None = None,
     ) -> None:
         """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion`
         (4,) w x y z, body_from_base. `contact_bodies`: names or numbers of bodies; `friction` of the rod on
-        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `feel`: MuJoCo's
-        contacts of the capsules bend the rod (`ContactFeedback`). `name` as given to `add_capsules`. The time
-        step is the model's. Raises `HostError`, `InputError`."""
+        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `name` as given to
+        `add_capsules`. `dynamics`: the rod moves with inertia; left out, where it can (`CarriedRod`). The
+        time step is the model's. Raises `HostError`, `InputError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
@@ -166,8 +156,6 @@ class MujocoRod(CarriedRod):
         )
         self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
         self._width = _sizes(robot, per_segment)[1]
-        self._feedback = ContactFeedback(robot.n_segments, per_segment, self._width) if feel else None
-        self._line_force: Floats | None = None
 
     @property
     def felt(self) -> Felt:
@@ -212,45 +200,6 @@ class MujocoRod(CarriedRod):
 
     def _step_engine(self) -> None:
         mujoco().mj_step(self.model, self.data)
-
-    def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        if self._feedback is None:
-            return inputs
-        own = self._feedback.line_force()
-        given = self._distributed(inputs)
-        return inputs | {"line_force": own if given is None else own + given}
-
-    def _accepted(self, inputs: dict[str, Any]) -> None:
-        if self._feedback is not None:
-            self._line_force = self._distributed(inputs)
-
-    def _distributed(self, inputs: dict[str, Any]) -> Floats | None:
-        """The line force that is commanded, without what is felt; a copy [N/m]."""
-        given = inputs.get("line_force", self._line_force)
-        if given is None:
-            return None
-        shape = (self.rod.robot.n_segments, len(self._geoms) // self.rod.robot.n_segments + 1, 3)
-        try:
-            force = np.array(given, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"line_force is not an array of numbers; with feel=True give (3,) or {shape} [N/m]."
-            ) from error
-        if force.shape not in ((3,), shape):
-            raise InputError(
-                f"line_force has shape {force.shape}; with feel=True give (3,) or {shape} [N/m]."
-            )
-        return force
-
-    def _arrived(self) -> None:
-        self._release()
-        if self._feedback is not None:
-            self._feedback.take(self.felt, self.simulator)
-
-    def _forget(self) -> None:
-        self._release()
-        if self._feedback is not None:
-            self._feedback.forget()
 
     def _release(self) -> None:
         self.host.release()

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError, nearest
-from fastrod.hosts.host import Motion
+from fastrod.hosts.host import Freedom, Motion
 from fastrod.hosts.link import mount_pose
-from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
+from fastrod.rotation import product, quaternion_from_matrix
 from fastrod.types import Floats
 
 
@@ -142,11 +142,37 @@ class MujocoBody:
     def motion(self) -> Motion:
         """Of the rod's base, with the joints as they are now."""
         refresh(self.model, self.data)
-        pose = np.concatenate([self.data.xpos[self.body], self.data.xquat[self.body]])
-        velocity = velocity_of(self.model, self.data, self.body, com=False) + self.mocap_velocity
-        arm = matrix_from_quaternion(pose[None, 3:])[0] @ self._position
-        velocity[:3] += np.cross(velocity[3:], arm)
-        return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
+        pose = self._base()
+        velocity = velocity_of(self.model, self.data, self.body, com=False)
+        velocity[:3] += np.cross(velocity[3:], pose[:3] - self.data.xpos[self.body])
+        return Motion(pose, velocity + self._given_velocity(pose[:3]))
+
+    def _base(self) -> Floats:
+        arm = self.data.xmat[self.body].reshape(3, 3) @ self._position
+        position = self.data.xpos[self.body] + arm
+        return np.concatenate([position, product(self.data.xquat[self.body], self._quaternion)])
+
+    def _given_velocity(self, point: Floats) -> Floats:
+        """(6,) that a mocap body is given, at a point of it."""
+        velocity = self.mocap_velocity.copy()
+        velocity[:3] += np.cross(velocity[3:], point - self.data.xpos[self.body])
+        return velocity
+
+    def freedom(self, dt: float) -> Freedom:
+        """By the accelerations that the model has without the rod: of joints, actuators, contacts."""
+        lib, model, data = mujoco(), self.model, self.data
+        lib.mj_forward(model, data)
+        point = self._base()[:3]
+        slopes = np.zeros((4, 3, model.nv))
+        lib.mj_jac(model, data, slopes[0], slopes[1], point, self.body)
+        lib.mj_jacDot(model, data, slopes[2], slopes[3], point, self.body)
+        jacobian, change = slopes.reshape(2, 6, model.nv)
+        by_force = np.zeros_like(jacobian)
+        if model.nv:
+            lib.mj_solveM(model, data, by_force, jacobian)
+        gained = jacobian @ data.qacc + 0.5 * change @ data.qvel  # the latter bends the base's path
+        velocity = jacobian @ data.qvel + self._given_velocity(point)
+        return Freedom(jacobian @ by_force.T, velocity + dt * gained)
 
     def exert(self, wrench: Floats) -> None:
         """Force and moment about the base point, world, during the next mj_step, and until `release`."""

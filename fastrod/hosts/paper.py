@@ -10,11 +10,16 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod.hosts.bullet import pybullet
-from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.link import from_xyzw
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.segment_actions import SegmentActions
-from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix, quaternion_from_vector
+from fastrod.rotation import (
+    matrix_from_quaternion,
+    product,
+    quaternion_from_matrix,
+    quaternion_from_vector,
+    rotation_between,
+)
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 

@@ -16,29 +16,23 @@ from fastrod.contact import ContactScene
 from fastrod.contact.frames import between
 from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
 from fastrod.hosts.capsules import Capsules, along, moved
-from fastrod.hosts.host import Motion
+from fastrod.hosts.host import Freedom, Motion
 from fastrod.model.robot import Robot
+from fastrod.rotation import displaced, displacement, quaternion_from_matrix
 from fastrod.simulator import Simulator
+from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_shape
 from fastrod.solver.modal import Modes
+from fastrod.solver.motion import checked_mobility
+from fastrod.solver.rigid import rigid_exchange, rigid_inertia
 from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints
 
-INPUTS = (
-    "tendon_length",
-    "tension",
-    "extension",
-    "tip_force",
-    "tip_moment",
-    "line_force",
-    "point_force",
-    "follower_tip_force",
-    "follower_line_force",
-    "gravity",
-)
+INPUTS = tuple(name for name in Inputs._fields if name != "base_pose")
 """Inputs of a rod beside its base: keyword arguments of `Simulator.step`."""
 OBSTACLES = ("obstacle_pose", "obstacle_velocity")
 """Inputs of rods with a contact scene."""
+Given = dict[str, Any]  # inputs by name
 _PATIENCE = 2  # steps that fail before a rod in contact settles anew
 _MOST_FAILED = 25
 _MOST_SUBSTEPS = 100_000
@@ -54,7 +48,7 @@ class RodSnapshot(NamedTuple):
     """(n_robots, 6) on the base, world [N, N m]."""
     base: Floats
     """(n_robots, 7) pose of the base, world."""
-    inputs: dict[str, Any]
+    inputs: Given
     obstacles: dict[str, Floats]
     """Name -> (1 or n_robots, 7) pose as it was given last, world."""
     capsules: Capsules | None
@@ -62,6 +56,10 @@ class RodSnapshot(NamedTuple):
     """(n_robots,) the rod's own steps in a row that could not be solved."""
     fresh: Flags
     """(n_robots,) robots that settle before the next step."""
+    still: Flags
+    """(n_robots,) robots that came to rest: they begin with their base's motion."""
+    carried: Motion
+    """Where the rod's mass takes its base to be, and how it takes it to move."""
 
 
 @final
@@ -98,10 +96,9 @@ class Rod:
     ) -> None:
         """`dt`: the rod's longest step [s]; an engine's longer step is done in equal substeps. `contact`:
         what the rod feels. Capsules are as thick as contact has the rod. With `dynamics` the rod has its
-        inertia (`Simulator`), in the wrench as well: `settle` is at rest in the world, and the base's twist
-        is felt from the next step on. Its scheme is generalized-alpha, which takes steps of any length; with
-        `rho` 0 a host that is free must be 8 times as heavy as the rod, with 0.5 more than 20 times
-        (tests/wings/test_rod_in_motion.py). Raises `InputError`, `RobotError`."""
+        inertia (`Simulator`), in the wrench as well; after `settle` it is at rest on its base, and begins
+        with its motion. Its scheme is generalized-alpha, which takes steps of any length. Raises
+        `InputError`, `RobotError`."""
         check_robot(robot)
         if isinstance(n_robots, bool):
             raise InputError(
@@ -151,9 +148,7 @@ class Rod:
         self.time = 0.0
         """The rod's clock: the sum of the engine's steps [s]."""
         by_length = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
-        self._inputs: dict[str, Any] = (
-            {"tendon_length": np.array(robot.rest_tendon_length)} if by_length else {}
-        )
+        self._inputs: Given = {"tendon_length": np.array(robot.rest_tendon_length)} if by_length else {}
         self._home: Floats = np.array([*robot.base_position, *robot.base_quaternion], float)
         self._obstacles: dict[str, Floats] = {}
         self._state: State | None = None
@@ -162,6 +157,8 @@ class Rod:
         self._base: Floats = np.tile(self._home, (self.simulator.n_robots, 1))
         self._failed: Ints = np.zeros(self.simulator.n_robots, np.int64)
         self._fresh: Flags = np.zeros(self.simulator.n_robots, bool)
+        self._still: Flags = np.ones(self.simulator.n_robots, bool)
+        self._carried = Motion(self._base.copy(), self._wrench.copy())
 
     @property
     def state(self) -> State:
@@ -178,13 +175,13 @@ class Rod:
     @property
     def wrench(self) -> Floats:
         """(6,) force [N], then moment about the base point [N m], that the rod exerts on its base, world;
-        zero before the first step."""
+        zero before the first step. Where the base gives way (`inverse_inertia`) it is the mean over the
+        step, about where the base point was before it."""
         return self._one(self._wrench)
 
     @property
     def base(self) -> Floats:
-        """(7,) pose of the base that shape and wrench belong to: where the engine's step was expected to
-        end."""
+        """(7,) pose of the base that the shape belongs to: where the engine's step is expected to end."""
         return self._one(self._base)
 
     @property
@@ -212,7 +209,16 @@ class Rod:
             self.restore(before)
             raise
 
-    def advance(self, base_pose: ArrayLike, base_twist: ArrayLike, time_step: float, **inputs: Any) -> State:
+    def advance(
+        self,
+        base_pose: ArrayLike,
+        base_twist: ArrayLike,
+        time_step: float,
+        *,
+        inverse_inertia: ArrayLike | None = None,
+        free_twist: ArrayLike | None = None,
+        **inputs: Any,
+    ) -> State:
         """Return the rod at the end of the engine's next step of `time_step` [s].
 
         `base_pose` (7,) where the base is before the step, position [m] and quaternion w x y z, world;
@@ -220,6 +226,13 @@ class Rod:
         taken to continue. Inputs as for `Simulator.step`: `INPUTS`, and `obstacle_pose` and
         `obstacle_velocity` at the end of the step where there is a contact scene. Base and obstacles move
         there in the rod's own steps.
+
+        A base that gives way: `inverse_inertia` (6, 6), J M^-1 J^T of the engine at the base point, its
+        linear and angular acceleration by force and moment, world; `free_twist` (6,) its mean velocity over
+        the step if there were no rod, `base_twist` if left out. The rod and its base then move together,
+        stably at any ratio of masses, the rod in one step of `time_step`: with `dynamics` by its inertia,
+        without it by that of its shape as a rigid body. The engine is to feel `wrench` in this step, about
+        the base point where it is before it.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
         it stopped, with half the wrench of the engine's step before; after a few in a row the rod settles
@@ -229,36 +242,64 @@ class Rod:
         nothing has moved.
         """
         motion, n = self._motion(base_pose, base_twist), self._substeps(time_step)
+        freedom = self._freedom(inverse_inertia, free_twist, motion)
+        n = n if freedom is None else 1
         given, around = self._sorted(inputs)
         start, dt = self.snapshot(), self.simulator.dt
         try:
-            return self._advanced(motion, given, around, time_step, n)
+            return self._advanced(motion, given, around, time_step, n, freedom)
         except Exception:
             self.restore(start)
             self.simulator.dt = dt
             raise
 
     def _advanced(
-        self, motion: Motion, given: dict[str, Any], around: dict[str, Any], time_step: float, n: int
+        self, motion: Motion, given: Given, around: Given, time_step: float, n: int, freedom: Freedom | None
     ) -> State:
-        if self._state is None:
-            self._settled(motion.pose, given, around)
-        elif self._fresh.any():
-            self._settled_again(motion.pose, given, around)
+        wrench, free = self._wrench, motion if freedom is None else motion._replace(velocity=freedom.twist)
+        if self._state is None or self._fresh.any():
+            begins = given
+            if self.simulator.dynamics:  # at rest on its base, which may fall
+                gravity = np.array(given.get("gravity", self.robot.gravity), float)
+                gained = (free.velocity - motion.velocity)[:, :3] / time_step
+                begins = given | {"gravity": gravity - (gained if self.n_robots else gained[0])}
+            settle = self._settled if self._state is None else self._settled_again
+            settle(motion.pose, begins, around)
         self.simulator.dt = h = time_step / n
-        wrench = self._wrench
-        for k in range(n):
-            self._solved(
-                motion.after((k + 1) * h),
-                given,
-                self._obstacles_after(around, n - k) if n > 1 else around,
-                0.5 * wrench,
+        if self._still.any():
+            still = self._still[:, None]
+            self._carried = Motion(
+                *(np.where(still, a, b) for a, b in zip(motion, self._carried, strict=True))
             )
+            if self.simulator.dynamics:
+                # an engine's velocity is that of the middle of its last step
+                middle = 0.5 * (motion.velocity + free.velocity)
+                self.simulator.carry(np.broadcast_to(middle, wrench.shape), self._still)
+            self._still[:] = False
+        mobility = None if freedom is None or not self.simulator.dynamics else freedom.inverse_inertia
+        for k in range(n):
+            on_the_way = self._obstacles_after(around, n - k) if n > 1 else around
+            self._solved(free.after((k + 1) * h), given, on_the_way, 0.5 * wrench, mobility)
+        if freedom is not None and not self.simulator.dynamics:
+            self._give_way(motion, free.after(h), freedom.inverse_inertia, h)
         before, self._capsules = self._capsules, self._along(self.state)
         if before is not None:
             self._capsules = moved(before, self._capsules, time_step)
         self.time += time_step
         return self.state
+
+    def _give_way(self, motion: Motion, free: Floats, mobility: Floats, dt: float) -> None:
+        """Let a rod without inertia of its own have that of its shape as a rigid body, whose base is where,
+        and as fast as, the rod last took it to be."""
+        pose, velocity = self._carried
+        by = displacement(pose, np.broadcast_to(free, pose.shape))
+        inertia = rigid_inertia(self.robot, self.state.position)
+        mean = rigid_exchange(inertia, mobility, self._wrench, velocity, by, dt)
+        mean = np.where(self.state.ok[:, None], mean, self._wrench)
+        moved = by + dt * dt * np.einsum("nij,nj->ni", mobility, mean)
+        self._carried = Motion(displaced(pose, moved), moved / dt)
+        mean[:, 3:] += np.cross(free[..., :3] - motion.pose[..., :3], mean[:, :3])
+        self._wrench = mean
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put
@@ -292,6 +333,8 @@ class Rod:
             self._capsules,
             self._failed.copy(),
             self._fresh.copy(),
+            self._still.copy(),
+            self._carried,
         )
 
     def restore(self, snapshot: RodSnapshot) -> None:
@@ -304,17 +347,18 @@ class Rod:
         self.time, self._state, self._capsules = snapshot.time, snapshot.state, snapshot.capsules
         self._failed, self._fresh = snapshot.failed.copy(), snapshot.fresh.copy()
         self._wrench, self._base = snapshot.wrench.copy(), snapshot.base.copy()
+        self._still, self._carried = snapshot.still.copy(), snapshot.carried
         self._inputs, self._obstacles = dict(snapshot.inputs), dict(snapshot.obstacles)
 
-    def _settled(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
+    def _settled(self, base: Floats, given: Given, around: Given) -> State:
         self._keep(
             self.simulator.settle(base_pose=base, **around, **given), given, around, base, 0.5 * self._wrench
         )
-        self._fresh[:] = False
+        self._fresh[:], self._still[:] = False, True
         self._capsules = self._along(self.state)
         return self.state
 
-    def _settled_again(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> None:
+    def _settled_again(self, base: Floats, given: Given, around: Given) -> None:
         """Settle rods that were reset, while the others continue."""
         rows, going = self._fresh, self._wrench
         self._keep(self._anew(rows, base, given, around), given, around, base, going)
@@ -324,11 +368,17 @@ class Rod:
         self._capsules = Capsules(
             *(np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, before, strict=True))
         )
-        self._fresh = rows & ~self.state.ok
+        self._fresh, self._still = rows & ~self.state.ok, self._still | rows
 
-    def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any], half: Floats) -> None:
+    def _solved(
+        self, base: Floats, given: Given, around: Given, half: Floats, mobility: Floats | None
+    ) -> None:
         """One step of the rod itself; `half` (n_robots, 6) the wrench of those that fail."""
-        state = self.simulator.step(base_pose=base, **around, **given)
+        mobility = mobility if mobility is not None and mobility.any() else None
+        state = self.simulator.step(base_pose=base, inverse_inertia=mobility, **around, **given)
+        if mobility is not None:
+            turned = quaternion_from_matrix(state.rotation[:, 0])
+            base = np.concatenate([state.position[:, 0], turned], axis=1)
         again = ~state.ok & (state.passes != 0) & (self._failed >= _PATIENCE)
         if again.any():
             state = self._anew(again, base, given, around)
@@ -341,7 +391,7 @@ class Rod:
                 "Move host, bodies and inputs by less in a step, or after a jump call reset()."
             )
 
-    def _anew(self, rows: Flags, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
+    def _anew(self, rows: Flags, base: Floats, given: Given, around: Given) -> State:
         """These rods at rest, from the straight rod; the others, memories and clocks of their effects too,
         stay as they are."""
         sim = self.simulator
@@ -357,7 +407,7 @@ class Rod:
         return sim.state
 
     def _keep(
-        self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats, half: Floats
+        self, state: State, given: Given, around: Mapping[str, Any], base: Floats, half: Floats
     ) -> None:
         """Take a state over. Rods that are lost in it stay as they were; those that are not ok have the
         wrench `half` (n_robots, 6)."""
@@ -381,10 +431,11 @@ class Rod:
             name: np.array(np.atleast_2d(pose), float)
             for name, pose in (around.get("obstacle_pose") or {}).items()
         }
-        self._wrench = np.where(state.ok[:, None], state.base_wrench, half)
+        wrench = state.base_wrench if state.mean_wrench is None else state.mean_wrench
+        self._wrench = np.where(state.ok[:, None], wrench, half)
         self._base = np.where(lost[:, None], self._base, np.broadcast_to(base, self._base.shape))
 
-    def _sorted(self, inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _sorted(self, inputs: Given) -> tuple[Given, Given]:
         """Inputs of the rod with those it has already, and what is around it."""
         known = INPUTS if self.simulator.contact is None else (*INPUTS, *OBSTACLES)
         for name in inputs:
@@ -401,7 +452,7 @@ class Rod:
         around = {name: inputs[name] for name in OBSTACLES if name in inputs}
         return self._inputs | {name: value for name, value in inputs.items() if name not in OBSTACLES}, around
 
-    def _obstacles_after(self, around: dict[str, Any], steps: int) -> dict[str, Any]:
+    def _obstacles_after(self, around: Given, steps: int) -> Given:
         """Return the obstacles after the first of the `steps` that lead to their given poses."""
         scene = self.simulator.contact
         if scene is None or not around.get("obstacle_pose"):
@@ -442,6 +493,19 @@ class Rod:
         pose, twist = np.atleast_2d(self._poses(base_pose)), np.atleast_2d(self._twists(base_twist))
         n = max(len(pose), len(twist))
         return Motion(np.broadcast_to(pose, (n, 7)), np.broadcast_to(twist, (n, 6)))
+
+    def _freedom(
+        self, inverse_inertia: ArrayLike | None, free_twist: ArrayLike | None, motion: Motion
+    ) -> Freedom | None:
+        if inverse_inertia is None:
+            if free_twist is not None:
+                raise InputError(
+                    "free_twist goes with inverse_inertia; without it the base moves as it is told."
+                )
+            return None
+        twist = motion.velocity if free_twist is None else self._twists(free_twist)
+        given = checked_mobility(inverse_inertia, self.simulator.n_robots)
+        return Freedom(given, np.broadcast_to(twist, motion.velocity.shape))
 
     def _poses(self, base_pose: ArrayLike) -> Floats:
         pose = self._rows("base_pose", base_pose, 7, "position [m] and quaternion w x y z")

@@ -12,7 +12,7 @@ from fastrod.errors import HostError
 from fastrod.hosts.body_contact import BodyContact, CollisionShape
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.host import Motion
-from fastrod.hosts.link import exert, from_xyzw
+from fastrod.hosts.link import com_motion, exert, from_xyzw
 from fastrod.types import Floats
 
 
@@ -36,7 +36,7 @@ class BulletBodyContact(BodyContact):
 
     def com(self) -> Motion:
         """Of the centre of mass' frame, not of the link's URDF frame."""
-        return _com_motion(self.bullet, self.body, self.link)
+        return com_motion(self.bullet, self.body, self.link)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
         """Return the link's displacement (3,) out of its deepest overlap with one of these bodies, world [m];
@@ -54,16 +54,6 @@ class BulletBodyContact(BodyContact):
         """(6,) force [N] and moment about the centre of mass [N m], world, for one `stepSimulation`: then
         PyBullet forgets it."""
         exert(self.bullet, self.body, self.link, wrench, self.com().pose[:3])
-
-
-def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:
-    if link < 0:
-        position, quaternion = bullet.getBasePositionAndOrientation(body)
-        linear, angular = bullet.getBaseVelocity(body)
-    else:
-        state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
-        position, quaternion, linear, angular = state[0], state[1], state[6], state[7]
-    return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
 
 
 def _shapes(bullet: Bullet, body: int, link: int) -> list[CollisionShape]:

@@ -180,19 +180,21 @@ def _compile(function: _Function, folder: str | None = CACHE_DIR, **options: boo
     before = _config.CACHE_DIR
     _config.CACHE_DIR = folder or before
     try:
-        made = _njit(cache=folder is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(
-            function
-        )
+        options = {"nogil": True} | options
+        made = _njit(cache=folder is not None, error_model="numpy", fastmath=_FAST, **options)(function)
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)
 
 
-def pointed(function: _Function, signature: Any) -> tuple[_Function, int]:
+def pointed(function: _Function, signature: Any, **options: bool) -> tuple[_Function, int]:
     """`function` compiled by itself for one signature, and its address in this process for a `caller`: the
-    kernels that call it need not be compiled again. Without the compiler a number that stands for it."""
+    kernels that call it need not be compiled again. Without the compiler a number that stands for it.
+    `options` of numba's njit, such as nogil=False where Python is called."""
     function = getattr(function, "py_func", function)
-    compiled = function if _config.DISABLE_JIT else _compile(function, folder=_own_folder(function))
+    compiled = (
+        function if _config.DISABLE_JIT else _compile(function, folder=_own_folder(function), **options)
+    )
     return compiled, _address_of(compiled, signature)
 
 

@@ -18,6 +18,7 @@ from fastrod.kernels.rod.modal.chunk import ModalRun
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
 from fastrod.kernels.rod.modal.fields import ModalWork
 from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints
+from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.modes import (
     N_INTERVALS,
     ModalBasis,
@@ -183,6 +184,29 @@ def no_points(n_robots: int) -> ModalPoints:
     return ModalPoints(*zeros)
 
 
+_LEAK = 1e-9
+"""Of the largest mobility: what a body gives way along where its joints hold it, so that its inertia is a
+number."""
+
+
+def no_hosts() -> ModalHost:
+    """Every base moves as it is told."""
+    return ModalHost(np.zeros((0, 6, 6)), np.zeros((0, 6)), np.zeros((0, 6)), np.zeros((0, 6, 6)))
+
+
+def hosts_of(inverse_inertia: Floats, length: float) -> ModalHost:
+    """Bodies that carry the bases, of inverse inertias (n_robots, 6, 6) about the base point, world; `length`
+    [m] weighs turns against displacements."""
+    unit = np.array([1.0, 1.0, 1.0, length, length, length])
+    size, axes = np.linalg.eigh(inverse_inertia * unit * unit[:, None])
+    largest = size[:, -1:]
+    with np.errstate(divide="ignore"):
+        inertia = (axes / np.maximum(size, _LEAK * largest)[:, None]) @ np.swapaxes(axes, 1, 2)
+    inertia = np.where(largest[:, :, None] > 0.0, inertia * unit * unit[:, None], 0.0)
+    n = len(inertia)
+    return ModalHost(inertia, np.zeros((n, 6)), np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan))
+
+
 class ModalSolver:
     """Robots of one layout as modes. `params` is replaced where effects change a robot's numbers."""
 
@@ -212,6 +236,8 @@ class ModalSolver:
         )
         self.iterations = np.zeros(n_robots, np.int64)
         self.points = no_points(n_robots)
+        self.host = no_hosts()
+        """Bodies that give way to the rods in the next step."""
         self._work: tuple[tuple[int, int], ModalWork] | None = None
 
     @property
@@ -260,7 +286,7 @@ class ModalSolver:
         chunks = -(-len(rows) // LANES)
         tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
         each = LANES * -(-chunks // tasks)
-        batch = ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, self.motion)
+        batch = self._batch(ports, self.motion, self.host)
         output, work = ModalOutput(self.samples, shape, moving), self._workspace(tasks)
 
         def run_some(task: int) -> None:
@@ -276,6 +302,39 @@ class ModalSolver:
         # pass takes four times as long
         for array in self.motion[:3]:
             array[np.abs(array) < _NOTHING] = 0.0
+
+    def _vectors(self, numbers: Floats) -> tuple[Floats, Floats]:
+        """(n, n_nodes, 4, 3) positions and directors, and (n, n_lumps, 3) positions, of numbers that have
+        inertia (`ModalMotion`)."""
+        m = len(self.pieces.segment) * len(self.basis.node) * NODE_VECTORS
+        nodes, lumps = numbers[:, :m], numbers[:, m:]
+        return nodes.reshape(len(numbers), -1, NODE_VECTORS // 3, 3), lumps.reshape(len(numbers), -1, 3)
+
+    def carry(self, rows: Ints, twist: Floats, scheme: int, dt: float) -> None:
+        """Let robots at rest move with their bases as rigid bodies: twist (n_rows, 6) of the base point,
+        world, as of the last `dt`."""
+        motion, place = self.motion, self.motion.place[rows]
+        linear, angular = twist[:, None, :3], twist[:, None, 3:]
+        nodes, lumps = self._vectors(place)
+        moved, base = np.cross(angular[:, :, None], nodes), nodes[:, :1, 0]
+        moved[:, :, 0] = linear + np.cross(angular, nodes[:, :, 0] - base)
+        carried = linear + np.cross(angular, lumps - base)
+        velocity = np.concatenate([moved.reshape(len(rows), -1), carried.reshape(len(rows), -1)], axis=1)
+        motion.velocity[rows] = velocity
+        if scheme != GENERALIZED_ALPHA:  # which remembers accelerations, measured at its first step
+            motion.place_other[rows], motion.velocity_other[rows] = place - dt * velocity, velocity
+
+    def momentum(self, mass: Floats) -> Floats:
+        """(n_robots, 6) linear and angular momentum about the origin, by what has inertia (n_robots, n)."""
+        (nodes, lumps), (by_node, by_lump) = (
+            self._vectors(a) for a in (self.motion.place, mass * self.motion.velocity)
+        )
+        linear = by_node[:, :, 0].sum(1) + by_lump.sum(1)
+        turning = np.cross(nodes, by_node).sum((1, 2)) + np.cross(lumps, by_lump).sum(1)
+        return np.concatenate([linear, turning], axis=1)
+
+    def _batch(self, ports: Ports, motion: ModalMotion, host: ModalHost) -> ModalBatch:
+        return ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, motion, host)
 
     def _run_of(
         self, rows: Ints, how: Step, jump: Floats | None, effort: tuple[float, int, int], remembers: int
@@ -334,7 +393,7 @@ class ModalSolver:
         )
         how, jump = (Step(REST, 1.0), None) if step is None else step[1:]
         run = self._run_of(rows, how, jump, (0.0, 1, 1), REST)
-        batch = ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, motion)
+        batch = self._batch(ports, motion, no_hosts())
         derive_modes(run, batch, q, self._workspace(1), found)
         return found
 

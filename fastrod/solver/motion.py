@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError, Problem, nearest, shown
+from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.motion import ModalMotion
 from fastrod.kernels.rod.modal.output import MotionShape
 from fastrod.model.robot import Robot
-from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.solver.balances import Acting, Event
 from fastrod.solver.inputs import Inputs, arclengths, robot_mask
 from fastrod.solver.merge import merge_rows
-from fastrod.solver.modal import ModalSolver, Modes, Step, scheme_of
+from fastrod.solver.modal import ModalSolver, Modes, Step, hosts_of, no_hosts, scheme_of
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.state import Pose, Snapshot, State, check_on_robot
 from fastrod.solver.statics import Statics
@@ -38,6 +39,26 @@ class Moving(NamedTuple):
     """That the motion is remembered for; None at rest."""
 
 
+def checked_mobility(inverse_inertia: ArrayLike, n_robots: int) -> Floats:
+    """(n_robots, 6, 6) inverse inertia of bodies at a point. Raises `InputError` for what is none."""
+    try:
+        given = np.array(inverse_inertia, dtype=float)
+    except (TypeError, ValueError):
+        given = np.empty(0)
+    if given.shape not in ((6, 6), (n_robots, 6, 6)) or not np.isfinite(given).all():
+        raise InputError(
+            f"inverse_inertia has shape {given.shape}; give (6, 6) or ({n_robots}, 6, 6) finite numbers: "
+            "linear and angular acceleration of the base by force and moment, world."
+        )
+    size, even = np.abs(given).max(), 0.5 * (given + np.swapaxes(given, -1, -2))
+    if np.abs(given - even).max() > 1e-6 * size or np.linalg.eigvalsh(even).min() < -1e-6 * size:
+        raise InputError(
+            "inverse_inertia is not symmetric with eigenvalues of 0 or more; for a free body of mass m and "
+            "inertia J about its centre at the base it is diag(1/m, 1/m, 1/m, inv(J))."
+        )
+    return np.array(np.broadcast_to(even, (n_robots, 6, 6)))
+
+
 class Motions(Statics):
     """Robots of one layout, from one step to the next, by the solver that was chosen."""
 
@@ -49,6 +70,7 @@ class Motions(Statics):
     _tape: Tape | None = None
     _events: list[Event]  # of the call that is recorded
     _errors: Floats | None = None  # of the last step, where they are asked for
+    _host: ModalHost | None = None  # of the last step, where bodies gave way
 
     def _use_modes(self, dynamics: bool, scheme: str, rho: float, modes: Modes | None) -> None:
         """Take rods of modes. Raises `InputError` for a scheme that there is not, and where a robot has no
@@ -85,6 +107,75 @@ class Motions(Statics):
         elif passes != 1:
             raise InputError(f"passes is {passes!r}; the observer takes one a step, as settle takes many.")
 
+    def _give_way(self, inverse_inertia: ArrayLike | None) -> None:
+        """In the next step bodies of this inverse inertia carry the bases. Raises `InputError`."""
+        self._host = None
+        if inverse_inertia is None:
+            return
+        if self._modal is None or not self.dynamics:
+            raise InputError("inverse_inertia needs rods with inertia; give Simulator(robot, dynamics=True).")
+        if self.outputs != "full" or self._errors is not None or self._tape is not None:
+            raise InputError(
+                "inverse_inertia needs outputs='full', and goes neither with estimate_error nor with "
+                "record()."
+            )
+        given = checked_mobility(inverse_inertia, self.n_robots)
+        self._host = hosts_of(given, float(np.max(self._passes.params.rod_length)))
+
+    def carry(self, base_twist: ArrayLike, rows: ArrayLike | None = None) -> None:
+        """Let robots that were brought to rest move on with their bases as rigid bodies, at `base_twist` (6,)
+        or (n_robots, 6): velocity of the base point [m/s] and angular velocity [rad/s], world. `rows`:
+        indices or a mask, all without it. Raises `InputError` without `dynamics`, and before the first
+        state."""
+        self._last("carry")
+        if (modal := self._modal) is None or not self.dynamics:
+            raise InputError("carry needs rods with inertia; give Simulator(robot, dynamics=True).")
+        twist = np.asarray(base_twist, float)
+        if twist.shape not in ((6,), (self.n_robots, 6)) or not np.isfinite(twist).all():
+            raise InputError(
+                f"base_twist has shape {twist.shape}; give (6,) or ({self.n_robots}, 6) finite numbers: "
+                "velocity [m/s] and angular velocity [rad/s], world."
+            )
+        some = self._all if rows is None else np.flatnonzero(robot_mask(rows, self.n_robots))
+        some = some[self._warm[some]]
+        self._stepper.begun[some] = True
+        modal.carry(
+            some, np.broadcast_to(twist, (self.n_robots, 6))[some], self._stepper.time.scheme, self.dt
+        )
+
+    def momentum(self) -> Floats:
+        """(n_robots, 6) linear [kg m/s], then angular momentum about the origin [kg m^2/s], of rods in
+        motion, world. Raises `InputError` without `dynamics`, and before the first state."""
+        _, ports = self._last("momentum")
+        if (modal := self._modal) is None or not self.dynamics:
+            raise InputError("momentum needs rods with inertia; give Simulator(robot, dynamics=True).")
+        mass = modal.derive(np.flatnonzero(self._warm), ports, wanted=("number",)).inertia
+        return modal.momentum(mass)
+
+    def apparent_stiffness(self) -> Floats:
+        """(n_robots, 6, 6) by how much force and moment about the base point, which the rod exerts on its
+        base at the end of the last step, fall per displacement [m] and rotation [rad] of the base there,
+        world: H_bb - H_bq H_qq^-1 H_qb, inertia and all, and half the moment's own rotation, by which it is
+        not symmetric. It is that of the shape before the last Newton step: to rounding with more `passes`.
+        Raises `InputError` but after a step with `inverse_inertia`; nan for robots that took none."""
+        state, _ = self._last("apparent_stiffness")
+        if self._host is None:
+            raise InputError("apparent_stiffness is of a step with inverse_inertia; give it to step.")
+        stiffness = self._host.stiffness.copy()
+        stiffness[:, 3:, 3:] += 0.5 * np.cross(np.eye(3), state.base_wrench[:, None, 3:])
+        return stiffness
+
+    def _moved_bases(self, ports: Ports, found: PassShapes) -> Ports:
+        """The ports with bases where the bodies have come to."""
+        if (host := self._host) is None:
+            return ports
+        alone = np.isnan(host.wrench[:, 0])  # at rest, or in shorter steps
+        host.wrench[alone] = found.shape.base_wrench[alone]
+        pose = np.array(np.broadcast_to(ports.base_pose, (self.n_robots, 7)))
+        pose[:, :3] += host.moved[:, :3]
+        pose[:, 3:] = product(quaternion_from_vector(host.moved[:, 3:]), pose[:, 3:])
+        return ports._replace(base_pose=pose)
+
     def _step(self, given: Inputs, moved: tuple[Any, Any] | None, derive: bool) -> State:
         if (modal := self._modal) is None:
             return super()._step(given, moved, derive)
@@ -97,6 +188,7 @@ class Motions(Statics):
         found, ok = self._new_shapes(modal, len(rows) < self.n_robots), np.zeros(self.n_robots, bool)
         if len(cold):
             ok[cold] = self._stepper.rest(cold, cold[~self._warm[cold]], ports, found, _TOLERANCE)
+        modal.host = no_hosts() if self._host is None else self._host
         if len(warm) and before is not None:
             start = copied(modal.motion) if self._errors is not None else None
             inputs, jump = (before, ports), self._stepper.jumps(before, ports)
@@ -104,8 +196,9 @@ class Motions(Statics):
             if start is not None:
                 tip, other = found.shape.tip_position, self._new_shapes(modal, True)
                 self._errors = self._stepper.errors(warm[ok[warm]], inputs, jump, start, tip, other)
+        modal.host = no_hosts()
         self._note_call(modal)
-        return self._finish_modes(modal, ports, found, ok, rows, None)
+        return self._finish_modes(modal, self._moved_bases(ports, found), found, ok, rows, None)
 
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         if (modal := self._modal) is None:
@@ -113,7 +206,7 @@ class Motions(Statics):
         self._prepare(modal, ports)
         found, ok = self._new_shapes(modal, len(rows) < self.n_robots), np.zeros(self.n_robots, bool)
         ok[rows] = self._stepper.rest(rows, rows[~self._warm[rows]], ports, found, tolerance)
-        self._errors = None
+        self._errors = self._host = None
         self._note_call(modal)
         return self._finish_modes(modal, ports, found, ok, rows, only)
 
@@ -195,7 +288,8 @@ class Motions(Statics):
     def _return_state(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         state = super()._return_state(shape, ok, passes, problems)
         if self._moved is not None:
-            moved = self._moved._asdict() | {"step_error": self._errors}
+            mean = None if self._host is None else self._host.wrench.copy()
+            moved = self._moved._asdict() | {"step_error": self._errors, "mean_wrench": mean}
             self._state = state = replace(state, **moved)
         return state
 

@@ -91,6 +91,9 @@ class State:
     """(n_robots,) [J]"""
     strain_energy: Floats | None = None
     """(n_robots,) of the backbone [J]."""
+    mean_wrench: Floats | None = None
+    """(n_robots, 6) as `base_wrench`, but its mean over the step, about where the base point was before it:
+    with it rod and host exchange momentum and lose none. None but where the host's inertia was given."""
     step_error: Floats | None = None
     """(n_robots,) by how much the tip is off by the last step alone [m]; None but where it was asked for, nan
     of a robot that took none."""

@@ -11,6 +11,7 @@ import numpy as np
 from fastrod.contact.frames import blended
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import MotionShape
+from fastrod.rotation import displaced
 from fastrod.solver.modal import ModalSolver, Step
 from fastrod.solver.modal_response import full_newton
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
@@ -58,6 +59,8 @@ class TimeStepper:
         """Is called with what was solved; steps then go on until Newton's method ends."""
         self.divided = False
         """A step was taken in shorter ones."""
+        self.begun = np.zeros(modal.n_robots, bool)
+        """(n_robots,) who were set in motion since the last step: their accelerations are measured first."""
 
     def rest(self, rows: Ints, cold: Ints, ports: Ports, found: PassShapes, tolerance: float) -> Flags:
         """(n_rows,) who came to rest: from where they are, `cold` ones from straight, then under loads that
@@ -116,11 +119,28 @@ class TimeStepper:
         # BDF2 would need a step of the same length before
         one = GENERALIZED_ALPHA if scheme == BDF2 else scheme
         how, ok = self.time._replace(scheme=one, dt=self.time.dt / n), np.ones(len(rows), bool)
+        host, mean = modal.host, np.zeros_like(modal.host.wrench)
+        modal.host = body = host._replace(wrench=mean.copy(), moved=mean.copy())
+        # displacement of the bases from where they would be alone, and how much of it one step adds
+        aside, step = mean.copy(), mean.copy()
+        before = modal.motion.place[:, :3].copy()
         for k in range(n):
             if not ok.any():
                 break
             some = blended(*inputs, np.full(modal.n_robots, (k + 1) / n))
+            if len(mean):  # a body goes on at the speed that the rod has given it
+                aside += step
+                some = some._replace(base_pose=displaced(some.base_pose, aside))
+            arm = modal.motion.place[:, :3] - before
             ok[ok] = modal.step(rows[ok], some, *found, how, jump if k == 0 else np.zeros_like(jump))
+            if len(mean):
+                step += body.moved
+                aside += body.moved
+                mean += body.wrench / n
+                mean[:, 3:] += np.cross(arm, body.wrench[:, :3]) / n
+        modal.host = host
+        if len(mean):
+            host.wrench[rows[ok]], host.moved[rows[ok]] = mean[rows[ok]], aside[rows[ok]]
         for name, array, then in zip(ModalMotion._fields, modal.motion, start, strict=True):
             array[rows[~ok]] = then[~ok]
             if scheme != GENERALIZED_ALPHA and name.endswith("_other"):
@@ -153,11 +173,12 @@ class TimeStepper:
     def jumps(self, before: Ports, ports: Ports) -> Floats:
         """(n_robots,) 1 where an input changes by more than its last change was leading to."""
         n = self.modal.n_robots
-        jump, change = np.zeros(n), {}
+        jump, change = self.begun.astype(float), {}
+        self.begun[:] = False
         for name in _MOVING:
             now, then = getattr(ports, name), getattr(before, name)
-            if now is then:
-                continue
+            if now is then or (name == "base_pose" and len(self.modal.host.inertia)):
+                continue  # a body that gives way moves as the rod has it
             if then.shape[1:] != now.shape[1:] or not len(now) or not len(then):
                 if len(now) or len(then):
                     jump[:] = 1.0

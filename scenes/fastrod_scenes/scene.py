@@ -35,6 +35,7 @@ _SCENES: Mapping[str, str] = {
     "track_square": "fastrod_scenes.ur5.tracking:TrackSquare",
     "track_square_helix": "fastrod_scenes.ur5.tracking:TrackSquareHelix",
     "ur5_mujoco": "fastrod_scenes.ur5.pressing:UR5Mujoco",
+    "whip": "fastrod_scenes.ur5.whip:UR5Whip",
     "wall": "fastrod_scenes.contact.wall:Wall",
 }
 

@@ -26,7 +26,7 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     n = len(q)
     link = BulletLink(world, arm, n - 1, **MOUNT)
     robot = soft_robot(line_density=0.8)
-    rod = MountedRod(robot, link)
+    rod = MountedRod(robot, link, dynamics=False)
     rod.settle(tendon_length=robot.rest_tendon_length + np.array([-2, 1, 2, -1, 1, 0, -1, 0]) * 1e-3)
     mass, start = np.array(world.calculateMassMatrix(arm, q.tolist())), world.saveState()
 
@@ -44,7 +44,7 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     local, _ = world.multiplyTransforms(*world.invertTransform(frame, rotation), point.tolist(), [0, 0, 0, 1])
     by_rate = np.concatenate(world.calculateJacobian(arm, n - 1, local, q.tolist(), rate.tolist(), [0.0] * n))
     expected = by_rate.T @ rod.wrench
-    assert np.abs(expected).max() > 0.1
+    assert np.abs(expected).max() > 0.03
     assert np.abs(felt - expected).max() < 1e-6 * np.abs(expected).max()
 
 

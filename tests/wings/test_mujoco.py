@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from bullets import clearance_of, soft_robot
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from refusals import refusals
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +16,6 @@ from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import com_motion, refresh
 from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
-from fastrod.simulator import Simulator
 from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
 
 MOUNT = {"position": (0.02, 0.01, 0.05), "quaternion": (0.5, 0.5, -0.5, 0.5)}
@@ -189,73 +188,6 @@ def test_contacts_of_the_capsules_are_read_back():
     assert_allclose(felt.arclength, 0.15, atol=2e-3)
     assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
     assert (np.abs(rod.wrench) < 1e-9).all()  # the rod itself knows nothing of it
-
-
-@pytest.mark.study
-def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
-    # k C is far above 1 here: the force taken over at once would throw the rod from side to side
-    rod, model, data = stand(SLIDING, feel=True)
-    data.xfrc_applied[model.body("ball").id, 0] = -0.05
-    tips = [rod.step().tip_position[0, 0] for _ in range(1000)]
-    late = np.array(tips[-100:])
-    expected = Simulator(soft_robot(), dt=0.005, points_per_segment=10)
-    still = expected.settle(soft_robot().rest_tendon_length, point_force=[(0.15, (-0.05, 0.0, 0.0))])
-    assert rod.wrench[0] == pytest.approx(-0.05, rel=0.01)
-    assert np.ptp(late) < 0.01 * abs(late.mean())
-    assert late.mean() == pytest.approx(still.tip_position[0, 0], rel=0.02)
-    assert np.abs(data.qvel).max() < 1e-3
-    given = rod.step(line_force=(0.1, 0.0, 0.0))
-    assert given.ok[0]
-    sentence = r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"
-    with pytest.raises(InputError, match=sentence):
-        rod.step(line_force=np.zeros((2, 3, 3)))
-    rod.reset()
-    rod.step(line_force=(0.0, 0.0, 0.0))
-
-
-def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own(monkeypatch):
-    rod, model, data = stand(SLIDING, feel=True)
-    ball, post = model.body("ball").id, model.body("post").id
-    data.xfrc_applied[ball, 0] = -0.05
-    for _ in range(100):
-        rod.step()
-    assert len(rod.felt.capsule) > 0
-    last, force = rod.rod.simulator.state, rod._feedback.force.copy()
-    assert np.abs(force).max() > 0.0
-    lost = dataclasses.replace(last, ok=np.array([False]), problems={0: "it stands."})
-    with monkeypatch.context() as patch:
-        for method in ("step", "settle"):
-            patch.setattr(rod.simulator, method, lambda *a, **b: lost)
-        patch.setattr(rod.simulator, "_state", lost)
-        patch.setattr(rod.simulator, "_warm", np.array([False]))
-        rod.step()
-    assert_array_equal(rod._feedback.force, force)
-    assert not data.xfrc_applied[post].any()
-    assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
-    assert rod.step().ok[0]
-
-
-def test_line_force_of_a_call_that_is_refused_is_not_kept():
-    rod, _, _ = stand("", feel=True)
-    given = np.array([0.1, 0.0, 0.0])
-    rod.step(line_force=given)
-    given[:] = 9.0  # the caller's own array
-    give = r"^line_force is not an array of numbers; with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"
-    for sentence, bad in {
-        "^line_force holds a value that is not finite": {"line_force": (np.nan, 0, 0)},
-        give: {"line_force": ("a", "b", "c")},
-        "^tip_force holds a value that is not finite": {
-            "line_force": (5.0, 0.0, 0.0),
-            "tip_force": (np.nan, 0.0, 0.0),
-        },
-    }.items():
-        for call in (rod.step, rod.settle):
-            with pytest.raises(InputError, match=sentence):
-                call(**bad)
-    rod.settle()
-    assert rod.rod.wrench[0] == pytest.approx(0.1 * 0.2, rel=1e-6)
-    rod.step()
-    assert rod.wrench[0] == pytest.approx(0.1 * 0.2, rel=1e-6)
 
 
 def test_capsules_of_another_robot_are_refused():

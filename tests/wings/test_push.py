@@ -62,11 +62,6 @@ def test_rod_can_be_taken_out_of_the_world():
     assert world.getNumBodies() == 1
 
 
-def test_the_old_name_of_contact_bodies_is_refused():
-    with pytest.raises(HostError, match=r"^touch is now contact_bodies; give contact_bodies=\.\.\."):
-        MountedRod(soft_robot(), carrier(empty_world()), touch=[0])
-
-
 @pytest.mark.parametrize("contact_bodies", ["cube", (1, 2, 3), 1.5, True])
 def test_contact_bodies_names_bodies(contact_bodies):
     sentence = r"^contact_bodies holds .*; give the number of a body, or \(body, link\)\.$"

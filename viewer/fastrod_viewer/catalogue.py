@@ -47,7 +47,9 @@ HOSTED_SCENES: Mapping[str, str] = {
 """Scenes in a PyBullet world (`pip install fastrod[hosts]`), likewise."""
 MUJOCO_SCENES: Mapping[str, str] = {
     "ur5_mujoco": "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and "
-    "feels the spring in its joints."
+    "feels the spring in its joints.",
+    "whip": "A UR5 in MuJoCo cracks a soft robot of five segments like a whip: its joints feel the rod's "
+    "inertia.",
 }
 """Scenes in a MuJoCo model (`pip install fastrod[mujoco]`), likewise."""
 

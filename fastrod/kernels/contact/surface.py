@@ -48,7 +48,7 @@ def signed_distance(
     lower = math.sqrt(dot(e, e)) - ball[3]
     if lower > bound:
         return lower, nothing, False
-    signed = surfaces.primitive[k, 0]
+    signed = max(surfaces.primitive[k, 0], surfaces.primitive[k, 2])
     if signed != 0:
         d, n = signed_at(signed, _size(k, surfaces), local)
         return d, mul(rotation_of(frame), n), True

@@ -13,11 +13,10 @@ from fastrod.control import ResolvedRate
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.gripper import Gripper
 from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.model.robot import Robot
-from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
+from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix, rotation_between
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, arm_tube, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask

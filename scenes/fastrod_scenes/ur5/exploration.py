@@ -93,7 +93,7 @@ class Exploration(SceneStage):
         tool = BulletLink(self.world, self.arm.body, self.arm.tip)
         self.bracket = Bracket(tool, [((0.0, 0.0, 0.0), (0.0, 0.0, ADAPTER))], RADIUS)
         link = BulletLink(self.world, self.arm.body, self.arm.tip, position=(0.0, 0.0, ADAPTER))
-        self.rod = MountedRod(robot, link, head_color=(0.1, 0.1, 0.1, 1.0))
+        self.rod = MountedRod(robot, link, head_color=(0.1, 0.1, 0.1, 1.0), dynamics=False)
         self.rods = (self.rod,)
         self.action: Floats = np.zeros(self.actions.n_actions)
         """(9,) of the soft robot: extension and two displacements a segment [m]."""

@@ -93,7 +93,7 @@ class SoftUR5:
         self.bracket = Bracket(
             BulletLink(b, self.arm.body, self.arm.tip), [(np.zeros(3), np.array([0.0, 0.0, ADAPTER]))], 0.015
         )
-        self.rod = MountedRod(track_robot(), host, capsules_per_segment=5)
+        self.rod = MountedRod(track_robot(), host, capsules_per_segment=5, dynamics=False)
         self.kinematics = SoftTip(
             self.rod.simulator, self.arm, flange_from_base=(0.0, 0.0, ADAPTER, 1.0, 0.0, 0.0, 0.0)
         )

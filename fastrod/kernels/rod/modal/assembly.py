@@ -38,6 +38,7 @@ from .fields import (
     hessian,
     path_change,
 )
+from .host import couple_piece, hosted
 from .interval import add_elasticity, add_local, local_of_piece
 from .modes import ModalBasis
 from .tendons import tendon_stiffness_of_piece
@@ -292,6 +293,8 @@ def assemble(b: ModalBasis, first_tendon: Ints, work: ModalWork) -> None:
         rotations_of_piece(p, b, work, moment, out)
         displacements_of_piece(p, b, work)
         coupling_of_piece(p, b, work)
+        if hosted(work):
+            couple_piece(p, b, work)
         pass_on(p, b, work)
         for i in range(BEYOND * W):
             work.beyond[0, i] = work.beyond[1, i]

@@ -42,6 +42,13 @@ def factor(m: LaneMatrix, replaced: Lanes) -> None:
 @kernel
 def solve(m: LaneMatrix, x: Lanes) -> None:
     """x = M^-1 x, M by `factor`."""
+    forward(m, x)
+    backward(m, x)
+
+
+@kernel
+def forward(m: LaneMatrix, x: Lanes) -> None:
+    """x = L^-1 x."""
     a, n = m.entries, m.n_columns
     row = n * W
     for i in range(n):
@@ -52,6 +59,13 @@ def solve(m: LaneMatrix, x: Lanes) -> None:
                 to[w] -= left[w] * right[w]
         for w in range(W):
             to[w] *= a[i * row + i * W + w]
+
+
+@kernel
+def backward(m: LaneMatrix, x: Lanes) -> None:
+    """x = L^-T x."""
+    a, n = m.entries, m.n_columns
+    row = n * W
     for step in range(n):
         i = n - 1 - step
         to = x[i * W : (i + 1) * W]

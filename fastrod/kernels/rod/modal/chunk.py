@@ -9,7 +9,7 @@ from fastrod.types import Floats, Ints
 from ...jit import kernel
 from ..lanes import W, read, write
 from .balance import demands_of_stations
-from .fields import L_CORRECTION, L_COUNT, L_DONE, P_L, P_UNEVEN, ModalWork, one_task
+from .fields import G_ON, L_CORRECTION, L_COUNT, L_DONE, P_L, P_UNEVEN, ModalWork, one_task
 from .follower import follow
 from .gather import (
     ModalBatch,
@@ -20,6 +20,7 @@ from .gather import (
     gather_pieces,
     gather_points,
 )
+from .host import no_host, note_momentum, start_host
 from .motion import (
     BDF1,
     REST,
@@ -125,14 +126,18 @@ def pass_of_modes(
         if stage == 0:
             begin_step(robots, motion, short, zero, work)
             base_soon(robots, motion, short, run.dt, work.base)
+            start_host(robots, batch.host, motion, short, zero, b, work)
         elif run.kind == REST:
             start_settling(robots, motion, work)
+            no_host(work)
         else:
             begin_step(robots, motion, scheme, jump, work)
+            start_host(robots, batch.host, motion, scheme, jump, b, work)
         if work.piece[0, P_UNEVEN * W] > 0.0:
             curvature_counted_from(b, work)
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
-        minimise(b, batch.pieces.first_tendon, command, work, run.tolerance, least, most)
+        first = batch.pieces.first_tendon
+        minimise(b, first, command, work, run.tolerance, least, most, robots, batch.host, motion)
         follow(work)
         for p in range(work.piece.shape[0]):
             demands_of_stations(p, b, work)
@@ -145,5 +150,7 @@ def pass_of_modes(
             if run.iterations[robots[w]] > 0 and run.kind == REST:
                 start_from_rest(w, robots[w], motion, run.remembers, work)
             elif run.iterations[robots[w]] > 0:
+                if read(work.host, G_ON, w) > 0.0:
+                    note_momentum(w, robots[w], batch.host, motion, scheme, jump[w], b, work)
                 end_step(w, robots[w], motion, scheme, jump[w], work)
     show_chunk(robots, n_robots, batch, output, work)

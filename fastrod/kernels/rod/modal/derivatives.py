@@ -34,6 +34,7 @@ from .fields import (
 )
 from .follower import follow, tip_motion
 from .gather import ModalBatch
+from .host import no_host
 from .modes import ModalBasis
 from .motion import (
     BDF1,
@@ -237,6 +238,7 @@ def derivatives_of_modes(
             base_soon(robots, batch.motion, scheme, run.dt, work.base)
         if work.piece[0, P_UNEVEN * W] > 0.0:
             curvature_counted_from(batch.basis, work)
+    no_host(work)
     for w in range(W):
         for a in range(unknowns.shape[1]):
             write(work.q, a, w, unknowns[robots[w], a])

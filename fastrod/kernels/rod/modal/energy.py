@@ -31,6 +31,7 @@ from .fields import (
     S_ROW,
     ModalWork,
 )
+from .host import add_energy_of_base, hosted
 from .modes import ModalBasis
 
 
@@ -129,3 +130,5 @@ def energy_of_shape(b: ModalBasis, command: Floats, work: ModalWork, energy: Lan
     last = work.node[work.piece.shape[0] - 1, b.width.shape[0]]
     for w in range(W):
         energy[w] -= dot(get(work.outside, 0, w), get(last, N_POS, w))
+    if hosted(work):
+        add_energy_of_base(work, energy)

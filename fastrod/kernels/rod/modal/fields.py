@@ -41,6 +41,12 @@ S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
 L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
 L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 17, 18, 19, 20
 
+# host: 1 where a base gives way, 1 in the first lane where any does; displacement of the base and its Newton
+# step; inertia of its body over kappa dt^2 (6, 6), its pose without the rod, kappa, the mean of the rod's
+# inertia that is known before the step, what a mean wrench has beyond that at the end, and where the base was
+G_ON, G_ANY, G_D, G_STEP, G_P = 0, 1, 2, 8, 14
+G_FREE, G_KAPPA, G_HISTORY, G_PULL, G_START, HOST = 50, 62, 63, 69, 75, 78
+
 
 class ModalWork(NamedTuple):
     """The buffers of a chunk of robots."""
@@ -98,6 +104,12 @@ class ModalWork(NamedTuple):
     """(NEWTON,)"""
     base: Lanes
     """(12,) rotation and position of the base."""
+    host: Lanes
+    """(HOST,)"""
+    host_matrix: Lanes
+    """(6, 6) the bases' own system, the modes eliminated."""
+    host_change: Lanes
+    """(6, n_q) derivatives of the balance by displacement and rotation of the base."""
 
 
 @inline
@@ -142,4 +154,7 @@ def one_task(work: ModalWork, i: int) -> ModalWork:
         work.scheme[i],
         work.newton[i],
         work.base[i],
+        work.host[i],
+        work.host_matrix[i],
+        work.host_change[i],
     )

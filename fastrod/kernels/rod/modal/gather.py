@@ -28,6 +28,7 @@ from .fields import (
     S_ROW,
     ModalWork,
 )
+from .host import ModalHost
 from .modes import GAUSS, ModalBasis
 from .motion import ModalMotion
 
@@ -85,6 +86,7 @@ class ModalBatch(NamedTuple):
     points: ModalPoints
     basis: ModalBasis
     motion: ModalMotion
+    host: ModalHost
 
 
 @inline

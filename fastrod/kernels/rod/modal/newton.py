@@ -13,9 +13,12 @@ from ...jit import inline, kernel
 from ...vec import Vec, dot
 from ..lanes import W, at, clear, get, get_mat, put_mat, read, write, write_at
 from .assembly import assemble
-from .cholesky import factor, solve
+from .cholesky import backward, factor, forward
 from .energy import energy_of_shape
 from .fields import (
+    G_D,
+    G_ON,
+    G_STEP,
     L_AGAIN,
     L_BEFORE,
     L_CORRECTION,
@@ -36,7 +39,9 @@ from .fields import (
     hessian,
 )
 from .follower import correct_step, follow
+from .host import ModalHost, give_way, hosted, move_base, place_base
 from .modes import ModalBasis
+from .motion import ModalMotion
 from .sweep import sweep_piece
 from .tendons import tendon_paths, tensions
 
@@ -52,6 +57,8 @@ TINY = 1e-3
 @kernel
 def sweep(b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork, with_columns: bool) -> None:
     """Shape, paths and tensions of q. `command` (4, n_tendons * LANES): `tensions`."""
+    if hosted(work):
+        place_base(work)
     for p in range(work.piece.shape[0]):
         sweep_piece(p, b, work, with_columns)
     tendon_paths(b, first_tendon, work, with_columns)
@@ -85,6 +92,11 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
                 unit = 5.0 if strain else read(work.piece[p], P_L, w)
                 size, largest = unit * abs(read(work.gradient, row, w)), read(newton, L_SIZE, w)
                 write(newton, L_SIZE, w, largest if size <= largest else size)  # NaN wins
+    for k in range(6 if hosted(work) else 0):
+        for w in range(W):
+            unit = 1.0 / read(work.piece[0], P_L, w) if k < 3 else 1.0
+            size, largest = unit * abs(read(work.host, G_STEP + k, w)), read(newton, L_SIZE, w)
+            write(newton, L_SIZE, w, largest if size <= largest else size)
     for w in range(W):
         size, done = read(newton, L_SIZE, w), read(newton, L_DONE, w) > 0.0
         if not done:
@@ -107,6 +119,8 @@ def take_step(work: ModalWork) -> None:
             step = fraction * read(work.gradient, a, w) if fraction > 0.0 else 0.0
             write(work.gradient, a, w, step)
             write(work.q, a, w, read(work.q, a, w) - step)
+    if hosted(work):
+        move_base(work, work.newton[L_STEP * W : (L_STEP + 1) * W])
 
 
 @inline
@@ -166,7 +180,7 @@ def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> in
         # the energy of a force that follows the rod is not the same after the step
         small = size * read(newton, L_STEP, w) < 1e-6 or (sigma == 0.0 and size < tolerance)
         followed = dot(follower, follower) > 0.0 or read(work.piece[0], P_FOLLOWED, w) > 0.0
-        small = small or (size < LONGEST_STEP and followed)
+        small = small or (size < LONGEST_STEP and (followed or read(work.host, G_ON, w) > 0.0))
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
         if read(newton, L_DONE, w) > 0.0:
             continue
@@ -174,6 +188,8 @@ def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> in
             write(newton, L_SIGMA, w, min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA))
             for a in range(len(work.q) // W):
                 write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
+            for k in range(6 if hosted(work) else 0):
+                write(work.host, G_D + k, w, read(work.host, G_D + k, w) + read(work.host, G_STEP + k, w))
             left += 1
             continue
         write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
@@ -195,6 +211,9 @@ def minimise(
     tolerance: float,
     least: int,
     most: int,
+    robots: Ints,
+    host: ModalHost,
+    motion: ModalMotion,
 ) -> None:
     """Iterate until every robot's last step was smaller than `tolerance` [rad], at least `least` and at most
     `most` times. Ends with the shape at q; what a robot did does not depend on its neighbours."""
@@ -211,11 +230,14 @@ def minimise(
         assemble(b, first_tendon, work)
         add_damping(b, work)
         factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 1) * W])
-        solve(hessian(work), work.gradient)
+        forward(hessian(work), work.gradient)
+        if hosted(work):
+            give_way(robots, host, b, motion, work)
+        backward(hessian(work), work.gradient)
         if on_tip:
             correct_step(work)
         small = measure_step(b, work, tolerance)
-        if not small and (follows or not known):
+        if not small and (follows or not known or hosted(work)):
             energy_of_shape(b, command, work, newton[L_BEFORE * W : (L_BEFORE + 1) * W])
             for w in range(W):
                 put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))

@@ -29,6 +29,7 @@ from .fields import (
     ModalWork,
 )
 from .gather import ModalBatch, along
+from .host import hosted, show_exchange
 from .modes import ModalBasis
 from .motion import NODE_VECTORS, ModalMotion, n_lumps
 from .sweep import MAGNUS, exp_series, rotation_of
@@ -239,6 +240,8 @@ def show_chunk(robots: Ints, n_robots: int, batch: ModalBatch, output: ModalOutp
             scatter(moving.strain[i, m], strain)
             shape.arclength[i, m] = arclength(m, w, samples, batch, work)
     show_forces(robots, n_robots, samples, b, work, shape)
+    if hosted(work):
+        show_exchange(robots, n_robots, batch.host, b, motion, work)
     for w in range(n_robots):
         for t in range(len(work.tension) // W):
             shape.tension[robots[w], t] = read(work.tension, t, w)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..lanes import W
-from .fields import BEYOND, COLUMN, HISTORY, INTERVAL, NEWTON, NODE, PIECE, S_ROW, ModalWork
+from .fields import BEYOND, COLUMN, HISTORY, HOST, INTERVAL, NEWTON, NODE, PIECE, S_ROW, ModalWork
 from .modes import ModalBasis
 
 
@@ -44,4 +44,7 @@ def modal_workspace(n_tasks: int, n_pieces: int, n_tendons: int, n_stations: int
         scheme=room(2),
         newton=room(NEWTON),
         base=room(12),
+        host=room(HOST),
+        host_matrix=room(36),
+        host_change=room(6 * n_q),
     )

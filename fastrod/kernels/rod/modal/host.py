@@ -1,0 +1,406 @@
+"""The base as six more unknowns: a body that gives way to the rod within the step.
+
+The body's engine moves it to x_free without the rod, the semi-implicit way of rigid-body engines: velocity
+from the forces, then position from the velocity. With the rod it comes to x_free + d, and momentum says
+  P d = w,   P = Lambda / dt^2,
+Lambda the body's inertia at the base point, w the mean over the step of the wrench that the rod exerts. The
+rod's scheme knows its wrench at the end of the step; the mean differs from it by that of inertia,
+  mean of a = kappa a + h,   kappa = g / (dt alpha),   h from what is remembered,
+so that rod and body exchange momentum and lose none. Divided by kappa this is one symmetric system with the
+balance of the modes; their unknowns are eliminated by the factor that is there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from fastrod.types import Floats, Ints
+
+from ...jit import inline, kernel
+from ...vec import Vec, add, axpy, cross, dot, exp_map, matmul, scale, sub
+from ..gather import scatter
+from ..lanes import LaneMatrix, Lanes, W, at, clear, get, get_mat, put, put_mat, read, write, write_at
+from .cholesky import factor, forward, solve
+from .fields import (
+    B_BACK,
+    B_F,
+    B_FIRST,
+    B_M,
+    B_MASS,
+    G_ANY,
+    G_D,
+    G_FREE,
+    G_HISTORY,
+    G_KAPPA,
+    G_ON,
+    G_P,
+    G_PULL,
+    G_START,
+    G_STEP,
+    H_J,
+    H_POS,
+    N_C,
+    N_POS,
+    P_L,
+    P_RHO,
+    S_HISTORY,
+    S_MASS,
+    S_POS,
+    ModalWork,
+    hessian,
+)
+from .modes import ModalBasis
+from .motion import (
+    NODE_VECTORS,
+    ModalMotion,
+    Scheme,
+    counted_from,
+    factors,
+    moved_on,
+    n_lumps,
+    node_number,
+    scheme_of,
+)
+
+
+class ModalHost(NamedTuple):
+    """Bodies that carry the bases; arrays of length 0 where every base moves as it is told."""
+
+    inertia: Floats
+    """(n_robots, 6, 6) about the base point, world: force [N] and moment [N m] by linear and angular
+    acceleration; 0 where the base moves as it is told."""
+    moved: Floats
+    """(n_robots, 6) out: displacement [m] and rotation vector of the base from `Ports.base_pose`, world."""
+    wrench: Floats
+    """(n_robots, 6) out: mean over the step, about where the base point was at its start, world."""
+    stiffness: Floats
+    """(n_robots, 6, 6) out: what the base must give the rod at the end of the step by its displacement and
+    rotation [N/m, N, N m]; of the shape before the last Newton step."""
+
+
+NEAR = 0.3
+"""rad, and of the first piece's length: a base that is further off was put elsewhere."""
+
+
+@inline
+def _three(a: Floats, m: int) -> Vec:
+    return a[m], a[m + 1], a[m + 2]
+
+
+@inline
+def hosted(work: ModalWork) -> bool:
+    """A base of the chunk gives way."""
+    return bool(work.host[G_ANY * W] > 0.0)
+
+
+@inline
+def mean_remembered(s: Scheme, x: float, v: float, x_other: float, v_other: float) -> float:
+    """h of one number: mean of its acceleration over the step = kappa a + h, a that at its end."""
+    _, g = factors(s)
+    mean = (moved_on(s, x, x, v, x_other, v_other)[1] - v) / s.dt
+    return mean - g / s.dt * (x - counted_from(s, x, v, x_other, v_other))
+
+
+@inline
+def _remembered(s: Scheme, motion: ModalMotion, i: int, m: int) -> Vec:
+    """h of three numbers."""
+    x, v, a, c = motion.place[i], motion.velocity[i], motion.place_other[i], motion.velocity_other[i]
+    h0 = mean_remembered(s, x[m], v[m], a[m], c[m])
+    h1 = mean_remembered(s, x[m + 1], v[m + 1], a[m + 1], c[m + 1])
+    return h0, h1, mean_remembered(s, x[m + 2], v[m + 2], a[m + 2], c[m + 2])
+
+
+@inline
+def _soon(s: Scheme, motion: ModalMotion, i: int, m: int) -> Vec:
+    """Three numbers a step later, at their velocity."""
+    return axpy(s.dt, _three(motion.velocity[i], m), _three(motion.place[i], m))
+
+
+@kernel
+def no_host(work: ModalWork) -> None:
+    """Every base is where it is told to be."""
+    clear(work.host)
+
+
+@kernel
+def start_host(
+    robots: Ints,
+    host: ModalHost,
+    motion: ModalMotion,
+    each: Scheme,
+    jump: Lanes,
+    b: ModalBasis,
+    work: ModalWork,
+) -> None:
+    """After `begin_step`: the bodies' inertia, where they would be, and the mean of the rod's inertia that is
+    known before the step."""
+    to, n_nodes = work.host, work.node.shape[1]
+    clear(to)
+    if len(host.inertia) == 0:
+        return
+    for w in range(W):
+        i, s = robots[w], scheme_of(each, jump[w])
+        on = host.inertia[i, 0, 0] > 0.0
+        alpha, g = factors(s)
+        kappa = g / (s.dt * alpha)
+        write(to, G_ON, w, 1.0 if on else 0.0)
+        write(to, G_ANY, 0, max(read(to, G_ANY, 0), 1.0 if on else 0.0))
+        write(to, G_KAPPA, w, kappa)
+        for k in range(36):
+            write(to, G_P + k, w, host.inertia[i, k // 6, k % 6] / (kappa * s.dt * s.dt))
+        put_mat(to, G_FREE, w, get_mat(work.base, 0, w))
+        put(to, G_FREE + 9, w, get(work.base, 9, w))
+        if not on:
+            continue
+        force, moment, m, base = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, _soon(s, motion, i, 0)
+        for p in range(work.node.shape[0]):
+            piece = work.piece[p]
+            for j in range(n_nodes):
+                mass = b.integral[n_nodes - 1, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
+                f = scale(mass, _remembered(s, motion, i, m))
+                force, moment = add(force, f), add(moment, cross(sub(_soon(s, motion, i, m), base), f))
+                for k in range(3):
+                    d = m + 3 + 3 * k
+                    spin = scale(read(work.history[p, j], H_J + k, w), _remembered(s, motion, i, d))
+                    moment = add(moment, cross(_soon(s, motion, i, d), spin))
+                m += NODE_VECTORS
+        for p in range(work.station.shape[0]):
+            for k in range(n_lumps(motion, work)):
+                f = scale(read(work.station[p, k], S_MASS, w), _remembered(s, motion, i, m))
+                force, moment = add(force, f), add(moment, cross(sub(_soon(s, motion, i, m), base), f))
+                m += 3
+        put(to, G_HISTORY, w, force)
+        put(to, G_HISTORY + 3, w, moment)
+        start_near(w, i, s, motion, work)
+
+
+@inline
+def start_near(w: int, i: int, s: Scheme, motion: ModalMotion, work: ModalWork) -> None:
+    """Newton's method begins with the base where the rod was leading it, as with the modes: a body that is
+    held is always elsewhere than the rod alone would have it."""
+    r, turned = get_mat(work.host, G_FREE, w), (0.0, 0.0, 0.0)
+    for k in range(3):
+        d = (r[k], r[3 + k], r[6 + k])
+        turned = axpy(0.5, cross(d, _soon(s, motion, i, 3 + 3 * k)), turned)
+    moved = sub(_soon(s, motion, i, 0), get(work.host, G_FREE + 9, w))
+    near = dot(turned, turned) < NEAR * NEAR and dot(moved, moved) < (NEAR * read(work.piece[0], P_L, w)) ** 2
+    put(work.host, G_D, w, moved if near else (0.0, 0.0, 0.0))
+    put(work.host, G_D + 3, w, turned if near else (0.0, 0.0, 0.0))
+
+
+@kernel
+def place_base(work: ModalWork) -> None:
+    """The base where its body has come to."""
+    for w in range(W):
+        turned, _, _, _ = exp_map(get(work.host, G_D + 3, w))
+        put_mat(work.base, 0, w, matmul(turned, get_mat(work.host, G_FREE, w)))
+        put(work.base, 9, w, add(get(work.host, G_FREE + 9, w), get(work.host, G_D, w)))
+
+
+@kernel
+def couple_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
+    """Work of a displacement and a rotation of the base on the modes of a piece, from `work.coupling` about
+    the start of the piece."""
+    n_modes, n_q = b.component.shape[0], len(work.q) // W
+    for w in range(W):
+        arm = sub(get(work.node[p, 0], N_POS, w), get(work.base, 9, w))
+        for a in range(n_modes):
+            pushed = get(work.coupling[a], 0, w)
+            turned = add(get(work.coupling[a], 3, w), cross(arm, pushed))
+            for k in range(3):
+                write(work.host_change, k * n_q + p * n_modes + a, w, pushed[k])
+                write(work.host_change, (3 + k) * n_q + p * n_modes + a, w, turned[k])
+
+
+@inline
+def inertia_about_base(w: int, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> tuple[Vec, Vec]:
+    """Force and moment about the base point that the accelerations at the end of the step need."""
+    base, alpha, n = get(work.base, 9, w), work.scheme[w], b.width.shape[0]
+    force, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for p in range(work.node.shape[0]):
+        piece = work.piece[p]
+        for j in range(n + 1):
+            node, mass = work.node[p, j], b.integral[n, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
+            moved = sub(get(node, N_POS, w), get(work.history[p, j], H_POS, w))
+            f = scale(mass * alpha, moved)
+            force, moment = add(force, f), add(moment, get(node, N_C, w))
+            moment = add(moment, cross(sub(get(node, N_POS, w), base), f))
+        for k in range(n_lumps(motion, work)):
+            station = work.station[p, k]
+            moved = sub(get(station, S_POS, w), get(station, S_HISTORY, w))
+            f = scale(read(station, S_MASS, w) * alpha, moved)
+            force = add(force, f)
+            moment = add(moment, cross(sub(get(station, S_POS, w), base), f))
+    return force, moment
+
+
+@inline
+def rigid_stiffness(work: ModalWork, r: int, c: int, w: int) -> float:
+    """Entry (r >= c) of H_bb: what the base must give by its own displacement and rotation, the modes
+    held."""
+    beyond = work.beyond[0]
+    if r < 3:
+        return read(beyond, B_MASS, w) if r == c else 0.0
+    if c < 3:  # [c]x of the first moment
+        x, y, z = get(beyond, B_FIRST, w)
+        row, first = r - 3, (0.0, -z, y)
+        if row == 1:
+            first = (z, 0.0, -x)
+        elif row == 2:
+            first = (-y, x, 0.0)
+        return first[c]
+    one, other = read(beyond, B_BACK + 3 * (r - 3) + c - 3, w), read(beyond, B_BACK + 3 * (c - 3) + r - 3, w)
+    return 0.5 * (one + other)
+
+
+@kernel
+def give_way(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> None:
+    """The Newton step of the bases into G_STEP, and its part in `work.gradient`, which is L^-1 g: between the
+    two halves of its solution. `work.host_change` becomes L^-1 H_qb."""
+    n_q, to = len(work.q) // W, work.host
+    matrix, right = LaneMatrix(work.host_matrix, 6), work.scratch
+    for k in range(6):
+        forward(hessian(work), work.host_change[k * n_q * W : (k + 1) * n_q * W])
+    for w in range(W):
+        inertia, turning = inertia_about_base(w, b, motion, work)
+        kappa = read(to, G_KAPPA, w)
+        for k in range(6):
+            needed = read(work.beyond[0], B_F + k, w)
+            mean = inertia[k] if k < 3 else turning[k - 3]
+            pull = (1.0 - kappa) * mean - read(to, G_HISTORY + k, w) - needed if kappa > 0.0 else 0.0
+            write(to, G_PULL + k, w, -pull / kappa - needed if kappa > 0.0 else 0.0)
+            write(right, k, w, needed + read(to, G_PULL + k, w))
+    for r in range(6):
+        for c in range(6):
+            for w in range(W):
+                spring = read(to, G_P + 6 * r + c, w)
+                write(right, r, w, read(right, r, w) + spring * read(to, G_D + c, w))
+        for c in range(r + 1):
+            for w in range(W):
+                write_at(matrix, r, c, w, rigid_stiffness(work, r, c, w))
+            for a in range(n_q):
+                for w in range(W):
+                    one, other = (
+                        read(work.host_change, r * n_q + a, w),
+                        read(work.host_change, c * n_q + a, w),
+                    )
+                    write_at(matrix, r, c, w, at(matrix, r, c, w) - one * other)
+            for w in range(W):
+                stiffness = at(matrix, r, c, w)
+                if read(to, G_ON, w) > 0.0:
+                    host.stiffness[robots[w], r, c] = host.stiffness[robots[w], c, r] = stiffness
+                write_at(matrix, r, c, w, stiffness + read(to, G_P + 6 * r + c, w))
+        for a in range(n_q):
+            for w in range(W):
+                less = read(work.host_change, r * n_q + a, w) * read(work.gradient, a, w)
+                write(right, r, w, read(right, r, w) - less)
+    for w in range(W):
+        on = read(to, G_ON, w) > 0.0
+        for r in range(6):
+            if not on:  # a base that is told where to be
+                write(right, r, w, 0.0)
+                write_at(matrix, r, r, w, 1e300)
+    factor(matrix, work.scratch[6 * W : 7 * W])
+    solve(matrix, right)
+    for k in range(6):
+        for w in range(W):
+            write(to, G_STEP + k, w, read(right, k, w))
+        for a in range(n_q):
+            for w in range(W):
+                less = read(work.host_change, k * n_q + a, w) * read(right, k, w)
+                write(work.gradient, a, w, read(work.gradient, a, w) - less)
+
+
+@kernel
+def move_base(work: ModalWork, fraction: Lanes) -> None:
+    """d -= `fraction` (1,) of the step, which is then the one that was taken."""
+    for k in range(6):
+        for w in range(W):
+            step = fraction[w] * read(work.host, G_STEP + k, w) if fraction[w] > 0.0 else 0.0
+            write(work.host, G_STEP + k, w, step)
+            write(work.host, G_D + k, w, read(work.host, G_D + k, w) - step)
+
+
+@kernel
+def add_energy_of_base(work: ModalWork, energy: Lanes) -> None:
+    """Add d . P d / 2 kappa, and what the mean over the step has beyond the end."""
+    for r in range(6):
+        for w in range(W):
+            moved, half = read(work.host, G_D + r, w), 0.0
+            for c in range(6):
+                half += 0.5 * read(work.host, G_P + 6 * r + c, w) * read(work.host, G_D + c, w)
+            energy[w] += moved * (half + read(work.host, G_PULL + r, w))
+
+
+@kernel
+def note_momentum(
+    w: int,
+    i: int,
+    host: ModalHost,
+    motion: ModalMotion,
+    each: Scheme,
+    jump: float,
+    b: ModalBasis,
+    work: ModalWork,
+) -> None:
+    """Before `end_step`: where the body of robot i has come to, and what of its mean wrench is the rod's
+    change of momentum, about where the base point was."""
+    s, n, m = scheme_of(each, jump), b.width.shape[0], 0
+    base, force, moment = _three(motion.place[i], 0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for p in range(work.node.shape[0]):
+        piece = work.piece[p]
+        for j in range(n + 1):
+            node, mass = work.node[p, j], b.integral[n, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
+            for k in range(4):
+                new = (
+                    node_number(node, 3 * k, w),
+                    node_number(node, 3 * k + 1, w),
+                    node_number(node, 3 * k + 2, w),
+                )
+                weight = mass if k == 0 else read(work.history[p, j], H_J + k - 1, w)
+                f, turning = _momentum(s, motion, i, m, new, base if k == 0 else (0.0, 0.0, 0.0))
+                force = axpy(-weight, f, force) if k == 0 else force
+                moment = axpy(-weight, turning, moment)
+                m += 3
+    for p in range(work.station.shape[0]):
+        for k in range(n_lumps(motion, work)):
+            weight = read(work.station[p, k], S_MASS, w)
+            f, turning = _momentum(s, motion, i, m, get(work.station[p, k], S_POS, w), base)
+            force, moment = axpy(-weight, f, force), axpy(-weight, turning, moment)
+            m += 3
+    put(work.host, G_START, w, base)
+    scatter(host.wrench[i, :3], force)
+    scatter(host.wrench[i, 3:], moment)
+    for k in range(6):
+        host.moved[i, k] = read(work.host, G_D + k, w)
+
+
+@inline
+def _momentum(s: Scheme, motion: ModalMotion, i: int, m: int, new: Vec, about: Vec) -> tuple[Vec, Vec]:
+    """Change over the step of the velocity of three numbers, and of its moment, over dt."""
+    x, v, a, c = motion.place[i], motion.velocity[i], motion.place_other[i], motion.velocity_other[i]
+    v0 = moved_on(s, new[0], x[m], v[m], a[m], c[m])[1]
+    v1 = moved_on(s, new[1], x[m + 1], v[m + 1], a[m + 1], c[m + 1])[1]
+    after = (v0, v1, moved_on(s, new[2], x[m + 2], v[m + 2], a[m + 2], c[m + 2])[1])
+    before = _three(v, m)
+    turning = sub(cross(sub(new, about), after), cross(sub(_three(x, m), about), before))
+    return scale(1.0 / s.dt, sub(after, before)), scale(1.0 / s.dt, turning)
+
+
+@kernel
+def show_exchange(
+    robots: Ints, n_robots: int, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork
+) -> None:
+    """Add to the mean wrench what acts on the rod from outside: inertia at the end of the step, less what the
+    base gave it there. To be called with the balance of the last shape in `work.beyond`."""
+    for w in range(n_robots):
+        i = robots[w]
+        if read(work.host, G_ON, w) <= 0.0:
+            continue
+        force, moment = inertia_about_base(w, b, motion, work)
+        force = sub(force, get(work.beyond[0], B_F, w))
+        moment = sub(moment, get(work.beyond[0], B_M, w))
+        moment = add(moment, cross(sub(get(work.base, 9, w), get(work.host, G_START, w)), force))
+        for k in range(3):
+            host.wrench[i, k] += force[k]
+            host.wrench[i, 3 + k] += moment[k]
