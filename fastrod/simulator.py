@@ -216,7 +216,7 @@ class Simulator(Motions):
         if self._felt is not None:
             return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
         self._spend(passes, estimate_error)
-        self._give_way(inverse_inertia)
+        self._free_bases(inverse_inertia)
         return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
 
     @named_inputs

@@ -84,9 +84,6 @@ ALLOWED: dict[str, str] = {
     "gym_envs/fastrod_envs/tasks/pick_place.py": "Grip grip",
     "gym_envs/fastrod_envs/tasks/reach.py": "Reach ReachOptions ReachRewardOptions ReachTask",
     "gym_envs/fastrod_envs/tasks/reach_obstacle.py": "reach ReachObstacle ReachTask",
-    # an old option, which is refused with the new one
-    "fastrod/hosts/mounted.py": "touch",
-    "fastrod/hosts/mujoco.py": "touch",
 }
 """Identifiers that stay, by file."""
 INSTEAD = {word: instead for words, instead in GONE.items() for word in words.split()}

@@ -36,7 +36,7 @@ from fastrod.errors import InputError
 from fastrod.kernels.contact.primitive import DISTANCE
 from fastrod.kernels.jit import pointed
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.types import Floats
+from fastrod.types import Flags, Floats
 
 _AT_SURFACE = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
 _NUDGE: Floats = 1e-11 * np.array([0.31, 0.57, 0.76])
@@ -163,6 +163,53 @@ def _distance_by_fcl(size: Triple, p: Triple) -> tuple[float, Triple]:
 def address() -> int:
     """Of the distance by FCL for kernels (`Surfaces.primitive`); `size[0]` is `number_of` the mesh."""
     return pointed(_distance_by_fcl, DISTANCE, nogil=False)[1]
+
+
+class BroadPhase:
+    """Which rods may touch an obstacle: FCL's dynamic tree over boxes of the obstacles, which moves with
+    them, asked with the box of every rod."""
+
+    def __init__(self, obstacles: Sequence[Obstacle], sphere: Floats) -> None:
+        """`sphere` (n_obstacles, 4): balls that hold them (`Surfaces`)."""
+        fcl, self._centres = _fcl(), []
+        self._tree, self._bodies = fcl.DynamicAABBTreeCollisionManager(), []
+        self._poses = np.empty(0)
+        for o, ball in zip(obstacles, sphere, strict=True):
+            low, high = ball[:3] - ball[3], ball[:3] + ball[3]
+            if o.shape == "mesh":
+                low, high = o.vertices.min(0), o.vertices.max(0)
+            self._centres.append(0.5 * (low + high) if np.isfinite(high).all() else None)
+            size = np.minimum(high - low, 1.0) if self._centres[-1] is None else high - low
+            self._bodies.append(fcl.CollisionObject(fcl.Box(*size), fcl.Transform()))
+        self._tree.registerObjects(self._bodies)
+        self._tree.setup()
+
+    def near(self, low: Floats, high: Floats, poses: Floats) -> Flags:
+        """(n,) whether the box from `low` to `high` (n, 3) of a rod meets that of an obstacle at `poses`
+        (1 or n, n_obstacles, 7), world. One without end is always met."""
+        if any(centre is None for centre in self._centres):
+            return np.ones(len(low), bool)
+        fcl, found = _fcl(), np.zeros(len(low), bool)
+        for i, (a, b) in enumerate(zip(low, high, strict=True)):
+            self._place(poses[i if len(poses) > 1 else 0])
+            rod, met = fcl.CollisionObject(fcl.Box(*(b - a)), fcl.Transform(0.5 * (a + b))), list[bool]()
+            self._tree.collide(rod, met, _note)
+            found[i] = bool(met)
+        return found
+
+    def _place(self, poses: Floats) -> None:
+        if np.array_equal(poses, self._poses):
+            return
+        fcl, rotations = _fcl(), matrix_from_quaternion(poses[:, 3:])
+        for body, centre, r, pose in zip(self._bodies, self._centres, rotations, poses, strict=True):
+            body.setTransform(fcl.Transform(r, pose[:3] + r @ centre))
+            self._tree.update(body)
+        self._poses = poses.copy()
+
+
+def _note(_one: Any, _other: Any, met: list[bool]) -> bool:
+    met.append(True)
+    return True  # one is enough
 
 
 class DirectScene:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fastrod.contact.contacts import Contacts, contacts_of
+from fastrod.contact.direct import BroadPhase
 from fastrod.contact.frames import back_by, between, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
@@ -83,12 +84,13 @@ class Engine:
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
+        self._broad: BroadPhase | None = None  # of scenes by FCL
         self._workspace: dict[tuple[int, ...], tuple[ContactProblem, SearchWork]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """What `pickle` and `copy` take: a workspace holds nothing between two iterations, and two engines
         never share one."""
-        return {**self.__dict__, "_workspace": {}}
+        return {**self.__dict__, "_workspace": {}, "_broad": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take up what `pickle` or `copy` made: compiled shapes stand elsewhere in another process."""
@@ -177,11 +179,38 @@ class Engine:
         one = np.ones(1)
         motion = self.motion(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
         work = search_work(threads, shape.arclength.shape[1])
-        search_gaps(threads, rows, self.rods, self.surfaces, motion, found, n_found, work)
+        near = rows if self.scene.collision == "bvh" else self._near(rows, shape)
+        if len(near):
+            search_gaps(threads, near, self.rods, self.surfaces, motion, found, n_found, work)
         if self.rods_meet:
             self.lower_gaps(rows, motion)
-        some[rows] = (self.clearance.gap[rows] < 0.0) | (n_found < 0)
+        some[rows] = self.clearance.gap[rows] < 0.0
+        some[near] |= n_found[: len(near)] < 0
         return self.whole_worlds(some)
+
+    def _near(self, rows: Ints, shape: RodShape) -> Ints:
+        """Those of `rows` that may touch an obstacle on their way to `shape`, by FCL's tree; the gap of the
+        others is at least what is watched."""
+        if self._broad is None:
+            self._broad = BroadPhase(self.scene.obstacles, self.surfaces.sphere)
+        watched = self.scene.watch * self.rods.length
+        moved = np.broadcast_to(
+            longest_move(self.poses_before, self.poses, self.surfaces.sphere), self.tracked.shape
+        )
+        before = shape if self.before is None else self.before
+        both = np.concatenate([shape.position[rows], before.position[rows]], axis=1)
+        around = (self.rods.radius.max(1) + watched + moved)[rows, None]
+        poses = self.poses if len(self.poses) == 1 else self.poses[rows]
+        known = np.isfinite(both).all((1, 2))
+        near = ~known
+        near[known] = self._broad.near(
+            (both.min(1) - around)[known],
+            (both.max(1) + around)[known],
+            poses if len(poses) == 1 else poses[known],
+        )
+        far = rows[~near]
+        self.clearance.gap[far] = watched[far]
+        return np.asarray(rows[near])
 
     def lower_gaps(self, rows: Ints, motion: ContactMotion) -> None:
         """Lower the gaps of these robots in `motion` to those between rods."""

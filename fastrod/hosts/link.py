@@ -90,10 +90,10 @@ class BulletLink:
         mass, _, inertia = bullet.getDynamicsInfo(self.body, link)[:3]
         pose = com_motion(bullet, self.body, link).pose
         rotation = matrix_from_quaternion(pose[None, 3:])[0]
-        turn = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
+        rotary = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
         across = np.cross(np.eye(3), point - pose[:3])  # [arm]x
-        by_force = np.eye(3) / mass - across @ turn @ across
-        return np.block([[by_force, -across @ turn], [turn @ across, turn]])
+        by_force = np.eye(3) / mass - across @ rotary @ across
+        return np.block([[by_force, -across @ rotary], [rotary @ across, rotary]])
 
     def exert(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the base point [N m], world, during the next stepSimulation."""

@@ -141,6 +141,7 @@ class Rod:
         """Longest step of the rod [s]."""
         self.robot = self.simulator.robots[0]
         self.n_robots = n_robots
+        self._weighs = any(s.line_density > 0.0 or s.lumps for s in robot.segments)
         self._nodes_per_capsule = points_per_segment // capsules_per_segment
         radius = (contact or ContactScene()).radius_of(robot)
         self.radius: Floats = np.repeat(radius, capsules_per_segment)
@@ -274,21 +275,21 @@ class Rod:
             if self.simulator.dynamics:
                 # an engine's velocity is that of the middle of its last step
                 middle = 0.5 * (motion.velocity + free.velocity)
-                self.simulator.carry(np.broadcast_to(middle, wrench.shape), self._still)
+                self.simulator.set_in_motion(np.broadcast_to(middle, wrench.shape), self._still)
             self._still[:] = False
         mobility = None if freedom is None or not self.simulator.dynamics else freedom.inverse_inertia
         for k in range(n):
-            on_the_way = self._obstacles_after(around, n - k) if n > 1 else around
-            self._solved(free.after((k + 1) * h), given, on_the_way, 0.5 * wrench, mobility)
-        if freedom is not None and not self.simulator.dynamics:
-            self._give_way(motion, free.after(h), freedom.inverse_inertia, h)
+            obstacles = self._obstacles_after(around, n - k) if n > 1 else around
+            self._solved(free.after((k + 1) * h), given, obstacles, 0.5 * wrench, mobility)
+        if freedom is not None and self._weighs and not self.simulator.dynamics:
+            self._as_rigid_body(motion, free.after(h), freedom.inverse_inertia, h)
         before, self._capsules = self._capsules, self._along(self.state)
         if before is not None:
             self._capsules = moved(before, self._capsules, time_step)
         self.time += time_step
         return self.state
 
-    def _give_way(self, motion: Motion, free: Floats, mobility: Floats, dt: float) -> None:
+    def _as_rigid_body(self, motion: Motion, free: Floats, mobility: Floats, dt: float) -> None:
         """Let a rod without inertia of its own have that of its shape as a rigid body, whose base is where,
         and as fast as, the rod last took it to be."""
         pose, velocity = self._carried

@@ -310,7 +310,7 @@ class ModalSolver:
         nodes, lumps = numbers[:, :m], numbers[:, m:]
         return nodes.reshape(len(numbers), -1, NODE_VECTORS // 3, 3), lumps.reshape(len(numbers), -1, 3)
 
-    def carry(self, rows: Ints, twist: Floats, scheme: int, dt: float) -> None:
+    def set_in_motion(self, rows: Ints, twist: Floats, scheme: int, dt: float) -> None:
         """Let robots at rest move with their bases as rigid bodies: twist (n_rows, 6) of the base point,
         world, as of the last `dt`."""
         motion, place = self.motion, self.motion.place[rows]

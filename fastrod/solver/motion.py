@@ -107,7 +107,7 @@ class Motions(Statics):
         elif passes != 1:
             raise InputError(f"passes is {passes!r}; the observer takes one a step, as settle takes many.")
 
-    def _give_way(self, inverse_inertia: ArrayLike | None) -> None:
+    def _free_bases(self, inverse_inertia: ArrayLike | None) -> None:
         """In the next step bodies of this inverse inertia carry the bases. Raises `InputError`."""
         self._host = None
         if inverse_inertia is None:
@@ -122,14 +122,14 @@ class Motions(Statics):
         given = checked_mobility(inverse_inertia, self.n_robots)
         self._host = hosts_of(given, float(np.max(self._passes.params.rod_length)))
 
-    def carry(self, base_twist: ArrayLike, rows: ArrayLike | None = None) -> None:
+    def set_in_motion(self, base_twist: ArrayLike, rows: ArrayLike | None = None) -> None:
         """Let robots that were brought to rest move on with their bases as rigid bodies, at `base_twist` (6,)
         or (n_robots, 6): velocity of the base point [m/s] and angular velocity [rad/s], world. `rows`:
         indices or a mask, all without it. Raises `InputError` without `dynamics`, and before the first
         state."""
-        self._last("carry")
+        self._last("set_in_motion")
         if (modal := self._modal) is None or not self.dynamics:
-            raise InputError("carry needs rods with inertia; give Simulator(robot, dynamics=True).")
+            raise InputError("set_in_motion needs rods with inertia; give Simulator(robot, dynamics=True).")
         twist = np.asarray(base_twist, float)
         if twist.shape not in ((6,), (self.n_robots, 6)) or not np.isfinite(twist).all():
             raise InputError(
@@ -139,7 +139,7 @@ class Motions(Statics):
         some = self._all if rows is None else np.flatnonzero(robot_mask(rows, self.n_robots))
         some = some[self._warm[some]]
         self._stepper.begun[some] = True
-        modal.carry(
+        modal.set_in_motion(
             some, np.broadcast_to(twist, (self.n_robots, 6))[some], self._stepper.time.scheme, self.dt
         )
 

@@ -14,8 +14,8 @@ def rigid_inertia(robot: Robot, position: Floats) -> Floats:
     n_steps = (position.shape[1] - 1) // robot.n_segments
     mass = np.zeros(position.shape[1])
     for k, segment in enumerate(robot.segments):
-        share = segment.line_density * segment.length / n_steps
-        mass[k * n_steps : (k + 1) * n_steps + 1] += share * np.r_[0.5, np.ones(n_steps - 1), 0.5]
+        each = segment.line_density * segment.length / n_steps
+        mass[k * n_steps : (k + 1) * n_steps + 1] += each * np.r_[0.5, np.ones(n_steps - 1), 0.5]
         for lump in segment.lumps:
             x = lump.at / segment.length * n_steps
             i = min(int(x), n_steps - 1)

@@ -12,8 +12,11 @@ import trimesh
 from numpy.testing import assert_allclose
 
 import fastrod
-from fastrod.contact import ContactScene, mesh, sphere
+from fastrod.contact import ContactScene, mesh, plane, sphere
+from fastrod.contact.direct import BroadPhase
+from fastrod.contact.tree import pack
 from fastrod.errors import InputError
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.state import State
 
 SOLIDS: dict[str, Any] = {
@@ -72,6 +75,29 @@ def test_it_measures_on_many_threads_and_after_a_copy() -> None:
     pull = robot.rest_tendon_length - 5e-4
     assert_allclose(other.step(pull).base_wrench, sim.step(pull).base_wrench, rtol=0.0, atol=0.0)
     assert state.ok.all()
+
+
+def test_the_tree_names_the_rods_that_may_touch() -> None:
+    """Boxes at random about obstacles that are turned at random: whoever overlaps is named, and many that are
+    away are not."""
+    rng = np.random.default_rng(0)
+    obstacles = [mesh(SOLIDS["ring"](), name="ring"), sphere(0.02, name="ball")]
+    surfaces = pack(obstacles)
+    tree = BroadPhase(obstacles, surfaces.sphere)
+    for _ in range(20):
+        quaternion = rng.normal(size=(2, 4))
+        quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+        poses = np.concatenate([rng.uniform(-0.1, 0.1, (2, 3)), quaternion], axis=1)
+        corners = matrix_from_quaternion(quaternion[:1])[0] @ obstacles[0].vertices.T + poses[0, :3, None]
+        low = rng.uniform(-0.2, 0.2, (40, 3))
+        high = low + rng.uniform(0.01, 0.05, (40, 3))
+        near = tree.near(low, high, poses[None])
+        inside = ((low[:, None] < corners.T) & (high[:, None] > corners.T)).all(2).any(1)
+        inside |= ((poses[1, :3] > low) & (poses[1, :3] < high)).all(1)
+        assert (near | ~inside).all()
+        assert 0 < near.sum() < 30
+    wall = BroadPhase([plane(point=(0, 0, 0), normal=(0, 0, 1))], np.array([[0.0, 0.0, 0.0, np.inf]]))
+    assert wall.near(low, high, poses[None, :1]).all()
 
 
 def test_the_choice_is_a_word() -> None:

@@ -32,7 +32,7 @@ def test_a_shaken_rod_gives_the_simulators_wrench() -> None:
     for k in range(20):
         twist = np.array([0.2 * np.sin(0.9 * k), 0.1, 0.0, 0.0, 2.0 * np.cos(0.7 * k), 1.0])
         if k == 0:
-            sim.carry(twist)
+            sim.set_in_motion(twist)
         state = rod.advance(base, twist, 0.004)
         for i in range(1, 5):
             expected = sim.step(base_pose=Motion(base, twist).after(0.001 * i))

@@ -150,8 +150,8 @@ class NeckLook(HostedScene):
             self.expect(bool(state.ok[0]), f"at {t:.3g} s the neck is not ok: {state.problems.get(0)}")
             clearance = min(clearance, float(state.contacts.clearance[0]))
             force = max(force, float(np.linalg.norm(state.contacts.total_force[0])))
-            share = self.dt / self.duration  # in the mean: the neck's inertia evens out
-            weighed += share * (float(rod.wrench[2]) + 0.4 * float(state.arclength[0, -1]) * 9.81)
+            fraction = self.dt / self.duration  # in the mean: the neck's inertia evens out
+            weighed += fraction * (float(rod.wrench[2]) + 0.4 * float(state.arclength[0, -1]) * 9.81)
             gave = max(
                 gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood))
             )

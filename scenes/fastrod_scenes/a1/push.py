@@ -105,8 +105,8 @@ class NeckPush(HostedScene):
             self.expect(bool(state.ok[0]), f"at {t:.3g} s the neck is not ok: {state.problems.get(0)}")
             force = rod.body_contacts[0].exerted[:3]
             extended = weight * state.arclength[0, -1] / stage.robot.length
-            share = self.dt / self.duration  # in the mean: the neck's inertia evens out
-            balance = balance + share * (rod.wrench[:3] + force - [0.0, 0.0, -extended])
+            fraction = self.dt / self.duration  # in the mean: the neck's inertia evens out
+            balance = balance + fraction * (rod.wrench[:3] + force - [0.0, 0.0, -extended])
             velocity = np.array(world.getBaseVelocity(cube)[0])
             given = self.dt * (force + _floor_force(world, cube) - [0.0, 0.0, 9.81 * MASS])
             momentum = max(momentum, float(np.abs(MASS * (velocity - before) - given).max()))

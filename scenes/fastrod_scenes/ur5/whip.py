@@ -107,8 +107,8 @@ class UR5Whip(MujocoScene):
         """Every step must be solved, the tip be faster than the flange by half, speed and force agree with a
         step of a quarter to 5 % of their largest, and the flange feel the change of the rod's momentum."""
         found, fine = self.crack(1), self.crack(FINER)
-        reach = float(np.hypot(*self.stage().rod.rod.settle().position[0, 0, :2]))
-        flange = SWING / LASTS * 1.5 * reach  # about: the fastest of an eased swing
+        radius = float(np.hypot(*self.stage().rod.rod.settle().position[0, 0, :2]))
+        flange = SWING / LASTS * 1.5 * radius  # about: the fastest of an eased swing
         speed = float(np.abs(found.speed - fine.speed).max() / fine.speed.max())
         force = float(
             np.sqrt(((found.force - fine.force) ** 2).sum(1).mean() / (fine.force**2).sum(1).mean())

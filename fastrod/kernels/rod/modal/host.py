@@ -254,7 +254,7 @@ def rigid_stiffness(work: ModalWork, r: int, c: int, w: int) -> float:
 
 
 @kernel
-def give_way(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> None:
+def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> None:
     """The Newton step of the bases into G_STEP, and its part in `work.gradient`, which is L^-1 g: between the
     two halves of its solution. `work.host_change` becomes L^-1 H_qb."""
     n_q, to = len(work.q) // W, work.host

@@ -39,7 +39,7 @@ from .fields import (
     hessian,
 )
 from .follower import correct_step, follow
-from .host import ModalHost, give_way, hosted, move_base, place_base
+from .host import ModalHost, base_step, hosted, move_base, place_base
 from .modes import ModalBasis
 from .motion import ModalMotion
 from .sweep import sweep_piece
@@ -232,7 +232,7 @@ def minimise(
         factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 1) * W])
         forward(hessian(work), work.gradient)
         if hosted(work):
-            give_way(robots, host, b, motion, work)
+            base_step(robots, host, b, motion, work)
         backward(hessian(work), work.gradient)
         if on_tip:
             correct_step(work)
