@@ -200,8 +200,8 @@ def hosts_of(inverse_inertia: Floats, length: float) -> ModalHost:
     unit = np.array([1.0, 1.0, 1.0, length, length, length])
     size, axes = np.linalg.eigh(inverse_inertia * unit * unit[:, None])
     largest = size[:, -1:]
-    with np.errstate(divide="ignore"):
-        inertia = (axes / np.maximum(size, _LEAK * largest)[:, None]) @ np.swapaxes(axes, 1, 2)
+    size = np.where(largest > 0.0, np.maximum(size, _LEAK * largest), 1.0)
+    inertia = (axes / size[:, None]) @ np.swapaxes(axes, 1, 2)
     inertia = np.where(largest[:, :, None] > 0.0, inertia * unit * unit[:, None], 0.0)
     n = len(inertia)
     return ModalHost(inertia, np.zeros((n, 6)), np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan))

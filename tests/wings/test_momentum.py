@@ -162,6 +162,33 @@ def test_a_held_base_bears_the_weight_and_the_inertia() -> None:
         assert_allclose(pushed.wrench[2], -0.4 * (GRAVITY + 5.0), rtol=1e-3)
 
 
+@pytest.mark.parametrize("dynamics", [True, False])
+def test_rods_of_a_batch_give_way_each_by_itself(dynamics: bool) -> None:
+    """A light body, one that is held, a heavy one; and back to a snapshot."""
+    robot, dt, n = heavy(0.2), 5e-3, 3
+    mobility = np.stack(
+        [np.diag([10.0] * 3 + [300.0] * 3), np.zeros((6, 6)), np.diag([2.0] * 3 + [50.0] * 3)]
+    )
+    every = Rod(robot, dt=dt, n_robots=n, dynamics=dynamics)
+    single = [Rod(robot, dt=dt, dynamics=dynamics) for _ in range(n)]
+    pose, twist = np.tile(HOME, (n, 1)), np.zeros((n, 6))
+    for k in range(8):
+        length = robot.rest_tendon_length - 5e-4 * np.sin(0.3 * k) * np.eye(len(robot.rest_tendon_length))[0]
+        free = twist - dt * GRAVITY * np.outer([1.0, 0.0, 1.0], np.eye(6)[2])
+        kept = every.snapshot()
+        for _ in range(2):
+            every.restore(kept)
+            every.advance(pose, twist, dt, inverse_inertia=mobility, free_twist=free, tendon_length=length)
+        for i, one in enumerate(single):
+            given: Any = {"inverse_inertia": mobility[i], "free_twist": free[i], "tendon_length": length}
+            one.advance(pose[i], twist[i], dt, **given)
+            assert_allclose(every.wrench[i], one.wrench, rtol=0.0, atol=1e-12)
+            assert_allclose(every.base[i], one.base, rtol=0.0, atol=1e-14)
+        twist = free + dt * np.einsum("nij,nj->ni", mobility, every.wrench)
+        pose = displaced(pose, dt * twist)
+    assert np.abs(every.wrench[1, 2] + 0.2 * GRAVITY) < 0.05
+
+
 def test_wrong_inverse_inertia_is_a_sentence() -> None:
     rod = Rod(heavy(0.1), dynamics=True)
     for given, sentence in {
