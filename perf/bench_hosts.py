@@ -127,7 +127,7 @@ def falls(ratio: float, dt: float) -> Row:
 
 
 def coupled(steps: int) -> list[Row]:
-    """A step of a rod on a body that gives way, beside one on a base that moves as it is told."""
+    """A step of a rod on a body that gives way, beside one on a base of prescribed motion."""
     import pairs
 
     rows = []
@@ -136,7 +136,7 @@ def coupled(steps: int) -> list[Row]:
         pull, row = np.eye(len(robot.rest_tendon_length))[0], dict[str, Any](what=name)
         for key, dynamics, mobility in (
             ("static_ms", False, None),
-            ("told_ms", True, None),
+            ("prescribed_ms", True, None),
             ("gives_way_ms", True, np.diag([1.0] * 3 + [600.0] * 3)),
         ):
             rod = fastrod.Rod(robot, dt=DT, dynamics=dynamics)
@@ -179,7 +179,7 @@ def measure(options: Any) -> list[Section]:
         table(
             "coupling",
             "What it costs to give way",
-            "what | static_ms:.2f quasi-static~ms | told_ms:.2f in motion,~base as told "
+            "what | static_ms:.2f quasi-static~ms | prescribed_ms:.2f in motion,~prescribed "
             "| gives_way_ms:.2f in motion,~gives way | ratio:.2f gives way~/ quasi-static",
             coupled(steps),
             "One thread, without an engine.",

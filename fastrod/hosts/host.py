@@ -28,7 +28,8 @@ class Freedom(NamedTuple):
     """(6, 6) J M^-1 J^T: linear and angular acceleration of the base by force and moment there, world; 0 of
     what is held."""
     twist: Floats
-    """(6,) mean velocity of the base over the step if there were no rod, world."""
+    """(6,) of the base at the end of the step if there were no rod, by which it also goes there, world:
+    engines step velocities first."""
 
 
 class Host(Protocol):

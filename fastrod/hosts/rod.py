@@ -229,8 +229,8 @@ class Rod:
         there in the rod's own steps.
 
         A base that gives way: `inverse_inertia` (6, 6), J M^-1 J^T of the engine at the base point, its
-        linear and angular acceleration by force and moment, world; `free_twist` (6,) its mean velocity over
-        the step if there were no rod, `base_twist` if left out. The rod and its base then move together,
+        linear and angular acceleration by force and moment, world; `free_twist` (6,) its velocity at
+        the step's end if there were no rod, `base_twist` if left out. The rod and its base then move together,
         stably at any ratio of masses, the rod in one step of `time_step`: with `dynamics` by its inertia,
         without it by that of its shape as a rigid body. The engine is to feel `wrench` in this step, about
         the base point where it is before it.
@@ -501,7 +501,7 @@ class Rod:
         if inverse_inertia is None:
             if free_twist is not None:
                 raise InputError(
-                    "free_twist goes with inverse_inertia; without it the base moves as it is told."
+                    "free_twist goes with inverse_inertia; without it the base's motion is prescribed."
                 )
             return None
         twist = motion.velocity if free_twist is None else self._twists(free_twist)

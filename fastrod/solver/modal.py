@@ -190,7 +190,7 @@ number."""
 
 
 def no_hosts() -> ModalHost:
-    """Every base moves as it is told."""
+    """The motion of every base is prescribed."""
     return ModalHost(np.zeros((0, 6, 6)), np.zeros((0, 6)), np.zeros((0, 6)), np.zeros((0, 6, 6)))
 
 

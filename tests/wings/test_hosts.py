@@ -37,14 +37,14 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     free = rates()
     world.restoreState(start)
     point = link.motion().pose[:3]
-    rod.begin(tip_force=(0.5, 0.2, -0.3), tip_moment=(0.01, 0.02, -0.01))
+    rod.begin(tip_force=(1.5, 0.6, -0.9), tip_moment=(0.01, 0.02, -0.01))
     felt = mass @ (rates() - free) / world.dt
     world.restoreState(start)
     _, _, _, _, frame, rotation = world.getLinkState(arm, n - 1, computeForwardKinematics=1)[:6]
     local, _ = world.multiplyTransforms(*world.invertTransform(frame, rotation), point.tolist(), [0, 0, 0, 1])
     by_rate = np.concatenate(world.calculateJacobian(arm, n - 1, local, q.tolist(), rate.tolist(), [0.0] * n))
     expected = by_rate.T @ rod.wrench
-    assert np.abs(expected).max() > 0.03
+    assert np.abs(expected).max() > 0.1
     assert np.abs(felt - expected).max() < 1e-6 * np.abs(expected).max()
 
 

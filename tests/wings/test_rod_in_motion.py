@@ -1,4 +1,4 @@
-"""`Rod` with inertia, on a base that moves as it is told."""
+"""`Rod` with inertia, on a base of prescribed motion."""
 
 from __future__ import annotations
 

@@ -64,11 +64,11 @@ from .motion import (
 
 
 class ModalHost(NamedTuple):
-    """Bodies that carry the bases; arrays of length 0 where every base moves as it is told."""
+    """Bodies that carry the bases; arrays of length 0 where the motion of every base is prescribed."""
 
     inertia: Floats
     """(n_robots, 6, 6) about the base point, world: force [N] and moment [N m] by linear and angular
-    acceleration; 0 where the base moves as it is told."""
+    acceleration; 0 where the motion of the base is prescribed."""
     moved: Floats
     """(n_robots, 6) out: displacement [m] and rotation vector of the base from `Ports.base_pose`, world."""
     wrench: Floats
@@ -118,7 +118,7 @@ def _soon(s: Scheme, motion: ModalMotion, i: int, m: int) -> Vec:
 
 @kernel
 def no_host(work: ModalWork) -> None:
-    """Every base is where it is told to be."""
+    """Every base is at its prescribed pose."""
     clear(work.host)
 
 
@@ -297,7 +297,7 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
     for w in range(W):
         on = read(to, G_ON, w) > 0.0
         for r in range(6):
-            if not on:  # a base that is told where to be
+            if not on:  # a base whose motion is prescribed
                 write(right, r, w, 0.0)
                 write_at(matrix, r, r, w, 1e300)
     factor(matrix, work.scratch[6 * W : 7 * W])
