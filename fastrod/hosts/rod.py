@@ -229,8 +229,8 @@ class Rod:
         there in the rod's own steps.
 
         A base that gives way: `inverse_inertia` (6, 6), J M^-1 J^T of the engine at the base point, its
-        linear and angular acceleration by force and moment, world; `free_twist` (6,) its velocity at
-        the step's end if there were no rod, `base_twist` if left out. The rod and its base then move together,
+        linear and angular acceleration by force and moment, world; `free_twist` (6,) its velocity at the
+        step's end if there were no rod, `base_twist` if left out. The rod and its base then move together,
         stably at any ratio of masses, the rod in one step of `time_step`: with `dynamics` by its inertia,
         without it by that of its shape as a rigid body. The engine is to feel `wrench` in this step, about
         the base point where it is before it.
