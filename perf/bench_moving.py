@@ -67,7 +67,7 @@ def sealed(seed: int) -> tuple[str, RunLog]:
         dl=dl,
         tip_position=np.zeros((2 * n, 3)),
     )
-    (pose,) = MotionReplay(sample(log), longest_step=5e-4).poses([plant])
+    (pose,) = MotionReplay(sample(log), longest_step=5e-4).poses([[plant]])
     return kind, replace(log, tip_position=pose.position + NOISE * rng.normal(size=pose.position.shape))
 
 

@@ -95,7 +95,9 @@ def identify(
     progressed, most = progress or (lambda *_: None), max_effects + _SPARE + 2
     log = split([logs] if isinstance(logs, RunLog) else list(logs), robot, held_out)
     # refuses a wrong [fit] before anything is solved
-    model = base_model(robot, free_camera=free_camera, dynamics=dynamics)
+    model = base_model(
+        robot, free_camera=free_camera, dynamics=dynamics, sessions=log.samples.sessions if dynamics else ("",)
+    )
     if dynamics:
         return _in_motion(
             log, robot, model, free_camera, frozenset(exclude), max_effects, progressed, threads
@@ -171,10 +173,11 @@ def _rings(
     log = log.swings
     progressed("base fit", 0, 1)
     some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
-    still = fit_base(some, log.rows, base_model(robot), robot, frozenset(), threads)
+    still = fit_base(some, log.rows, base_model(robot, sessions=log.samples.sessions), robot, frozenset(), threads)
     progressed("inertia and damping", 0, 1)
     moved = damped(robot)
-    moving = fit_motion(log.samples.on(log.rows), base_model(moved, dynamics=True), moved, threads=threads)
+    model = base_model(moved, dynamics=True, sessions=log.samples.sessions)
+    moving = fit_motion(log.samples.on(log.rows), model, moved, threads=threads)
     if moving.left > _LESS * still.left:
         return None
     result = _concluded(log, moving, _searched(moving, 0, progressed))
@@ -203,7 +206,9 @@ def _in_motion(
     base, without = fitted(model, robot), None
     if max_effects and not any(s.damping_time for s in robot.segments):
         moved = damped(robot)
-        other = fitted(base_model(moved, free_camera=free_camera, dynamics=True), moved)
+        other = fitted(
+            base_model(moved, free_camera=free_camera, dynamics=True, sessions=model.sessions), moved
+        )
         if other.left < _LESS * base.left:
             base, without = other, base
     progressed(base.sentence, 0, most)

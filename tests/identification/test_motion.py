@@ -85,7 +85,7 @@ def recorded(plant: Robot, runs: dict[str, int], t: np.ndarray, noise: float, st
         name="motion", t=np.tile(t, len(runs)), run=labels, dl=dl, tip_position=np.zeros((len(dl), 3))
     )
     samples = sample(log)
-    (pose,) = MotionReplay(samples, longest_step=step).poses([plant])
+    (pose,) = MotionReplay(samples, longest_step=step).poses([[plant]])
     tip = pose.position + noise * np.random.default_rng(7).normal(size=pose.position.shape)
     return replace(log, tip_position=tip)
 
@@ -234,7 +234,7 @@ def test_uneven_samples_are_interpolated() -> None:
     odd = np.sort(np.concatenate([t, t[:-1] + 0.0037]))
     dl = np.stack([np.interp(odd, t, row) for row in log.dl.T], axis=1)
     uneven = RunLog(name="u", t=odd, run=np.full(119, "a"), dl=dl, tip_position=np.zeros((119, 3)))
-    (at,) = MotionReplay(sample(uneven)).poses([plant])
+    (at,) = MotionReplay(sample(uneven)).poses([[plant]])
     assert at.ok.all()
     # another time step, second order: the motion is of 1e-2 m, 5 Hz and below, and its tendons have corners
     assert_allclose(at.position[np.isin(odd, t)], log.tip_position, atol=1e-4)
@@ -294,3 +294,25 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     shown = capsys.readouterr().out
     assert "the model is in motion" in shown
     assert (tmp_path / "out" / "residuals.csv").is_file()
+
+
+@pytest.mark.study
+def test_sessions_have_their_own_zeros_in_motion() -> None:
+    """Two runs of one robot on two days: the second day's zero and frame are its own, the mass is shared."""
+    monday = robot(effects=({"name": "marker_offset", "z": 0.0},))
+    tuesday = robot(
+        effects=(
+            {"name": "encoder_offset", "offset": [4e-4, -3e-4]},
+            {"name": "frame_misalignment", "shift_x": 2e-3},
+        )
+    )
+    t, days = np.arange(120) * 0.01, {"monday": monday, "tuesday": tuesday}
+    logs = [recorded(plant, {day: 1}, t, NOISE) for day, plant in days.items()]
+    logs = [replace(log, name=day, session=log.run) for log, day in zip(logs, days, strict=True)]
+    found = identify(logs, robot(density=0.25, fit={"segment.1.line_density": {"sd": 0.1}}), dynamics=True)
+    assert found.verdict == "none"
+    assert list(found.sessions) == ["tuesday"]
+    for number, true in ((1, 4e-4), (2, -3e-4)):
+        zero = found.base_parameters[f"session tuesday.tendon.{number}.zero"]
+        assert abs(zero.value - true) < 3.0 * zero.stderr
+        assert zero.stderr < 1e-4

@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.split import held_out_rows, merged
+from fastrod.logs.runlog import RunLog
 
 
 def samples(**changes: tuple[str, ...]) -> LogSamples:
@@ -72,3 +73,18 @@ def test_several_logs_become_runs_of_one() -> None:
     assert_array_equal(held.tip_force, np.repeat([[1.0], [0.0]], [80, 30], axis=0) * np.ones(3))
     mask, _ = held_out_rows(sample(both), ["second"])
     assert_array_equal(mask, np.repeat([False, True], [80, 30]))
+
+
+def test_a_gap_in_time_is_a_hold() -> None:
+    """Memories go on under the command before it, and no row is added to what is compared."""
+    t = np.concatenate([0.1 * np.arange(10), 20.0 + 0.1 * np.arange(10)])
+    dl = np.repeat([[0.0], [2e-3]], 10, axis=0)
+    tip = np.zeros((20, 3))
+    gapped = RunLog(name="gap", t=t, run=np.full(20, "a"), dl=dl, tip_position=tip)
+    held = sample(gapped)
+    assert len(held.log) == 21
+    assert_array_equal(held.origin[held.given], np.arange(20))
+    assert_array_equal(held.rows, held.given)
+    assert held.time[10] == pytest.approx(19.9)
+    assert held.log.dl[10, 0] == 0.0
+    assert_array_equal(sample(gapped.rows(slice(0, 10))).given, np.arange(10))

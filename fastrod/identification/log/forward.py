@@ -55,6 +55,7 @@ _LOST = 500
 _ROUGH = 1e-5, 1e-3  # of the length; rad
 _BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
 _SOON = 10.0  # s
+_GAP = 10.0  # times the usual time between two rows of a run
 _FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 MODES = Modes(4, 2)  # of rods that need modes, as far off
@@ -80,7 +81,7 @@ class LogSamples:
     log: RunLog
     """Only driven rows that have a time."""
     origin: Ints
-    """(n,) their rows in the log that was given."""
+    """(n,) their rows in the log that was given; of the end of a gap that of the row before it."""
     rows: Ints
     """(n_rows,) samples that are solved and compared."""
     runs: tuple[slice, ...]
@@ -93,6 +94,11 @@ class LogSamples:
     """(n,) number of each sample's session."""
     sessions: tuple[str, ...]
     """Their labels, that of most samples first; ("",) of a log without."""
+
+    @property
+    def given(self) -> Ints:
+        """Samples that are rows of the log, and not the ends of gaps."""
+        return np.flatnonzero(np.diff(self.origin, prepend=-1))
 
     @property
     def histories(self) -> tuple[slice, ...]:
@@ -111,11 +117,12 @@ class LogSamples:
 
 def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     """The samples of a log, moved by its drives where these were measured; runs that are interleaved are put
-    one after the other."""
+    one after the other. A gap in time is a hold: its inputs stay as they were up to one step before it
+    ends."""
     log = moved(log)
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
-    ordered = log.rows(order)
+    ordered, order = _held(log.rows(order), order)
     starts = np.flatnonzero(np.concatenate([[True], ordered.run[1:] != ordered.run[:-1]]))
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
@@ -145,6 +152,23 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
         np.argsort(largest_first)[number],
         tuple(labels[largest_first].tolist()),
     )
+
+
+def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
+    """The log with one more row where each gap ends, as before it and not measured; and the `order` (n,)
+    likewise."""
+    dt = np.where(log.run[1:] == log.run[:-1], np.diff(log.t), 0.0)
+    usual = {label: np.median(own) for label in log.runs if len(own := dt[(log.run[1:] == label) & (dt > 0.0)])}
+    step = np.array([usual.get(label, np.inf) for label in log.run[1:]])
+    before = np.flatnonzero(dt > _GAP * step)
+    if not len(before):
+        return log, order
+    both = np.insert(np.arange(len(log)), before + 1, before)
+    ends = before + 1 + np.arange(len(before))
+    made = log.rows(both)
+    t, tip = made.t.copy(), made.tip_position.copy()
+    t[ends], tip[ends] = log.t[before + 1] - step[before], np.nan
+    return replace(made, t=t, tip_position=tip), order[both]
 
 
 class RodAnswer(NamedTuple):

@@ -47,9 +47,10 @@ class MotionReplay:
     """None: one. A batch of differences fills a few lanes."""
 
     def poses(
-        self, robots: Sequence[Robot], progress: Callable[[int, int], None] | None = None
+        self, robots: Sequence[Sequence[Robot]], progress: Callable[[int, int], None] | None = None
     ) -> list[PredictedPose]:
-        """What the camera sees of each of these robots, effects and all. They must differ in numbers only.
+        """What the camera sees of each of these robots, effects and all; each is given as it is in every
+        session, or once. They must differ in numbers only.
 
         `ok` is False from where the rod is lost to the end of its run. Raises `InputError` for a robot
         without mass, `LogError` for a payload that changes within a run.
@@ -58,19 +59,24 @@ class MotionReplay:
 
         runs = self._compared()
         clock, masses = _clock(self.samples, runs, self.longest_step), self._payloads(runs)
-        rods = [_with_payload(robot, mass) for robot in robots for mass in masses]
+        session = [int(self.samples.session[span.start]) for span in runs]
+        rods = [
+            _with_payload(each[k if len(each) > 1 else 0], mass)
+            for each in robots
+            for k, mass in zip(session, masses, strict=True)
+        ]
         sim = Simulator(
             rods,
             dt=clock.dt,
             points_per_segment=4,
-            outputs="full" if self.points or robots[0].effects else "tip",
+            outputs="full" if self.points or rods[0].effects else "tip",
             threads=self.threads or 1,
             dynamics=True,
         )
-        given = _prepared(self.samples, robots[0])
+        given = _prepared(self.samples, rods[0])
         alive, seen = np.ones(len(rods), bool), list[Floats]()
         held = np.tile(_beside_rest(self.samples, runs), (len(robots), 1))
-        held = held @ matrix_from_quaternion(np.array([robots[0].base_quaternion]))[0].T
+        held = held @ matrix_from_quaternion(np.array([rods[0].base_quaternion]))[0].T
         kept = np.zeros((len(clock.wanted), len(rods)), bool)
         last = int(clock.wanted[-1])
         for step in range(last + 1):
@@ -209,11 +215,12 @@ def predict_motion(
     """Tip (n, 3) and the robot's `log_points` (n, k, 3) at every row of `log`, in its base frame [m], and
     which rows (n,) are found; k is 0 without `points`. Raises what `MotionReplay.poses` does."""
     samples = sample(let_go(log))
-    every = samples.on(np.arange(len(samples.log)))
-    (pose,) = MotionReplay(every, points=points).poses([robot], progress)
+    rows = samples.origin[samples.given]
+    every = samples.on(samples.given)
+    (pose,) = MotionReplay(every, points=points).poses([[robot]], progress)
     tip, ok = np.full((len(log), 3), np.nan), np.zeros(len(log), bool)
     further = np.full((len(log), len(robot.log_points) if points else 0, 3), np.nan)
-    tip[samples.origin], further[samples.origin], ok[samples.origin] = pose.position, pose.points, pose.ok
+    tip[rows], further[rows], ok[rows] = pose.position, pose.points, pose.ok
     return tip, further, ok
 
 

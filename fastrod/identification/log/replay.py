@@ -193,11 +193,11 @@ def _with_effects(
     samples, model = sample(log), known_model(robot)
 
     def solved(which: Ints) -> tuple[Floats, Floats, Flags]:
-        piece = samples.on(which)
+        piece = samples.on(samples.given[which])
         pose = predict(model, np.zeros(0), piece, PredictedRod(piece, robot, points=with_points))
         return pose.position, pose.points, pose.ok
 
-    return samples.origin, solved
+    return samples.origin[samples.given], solved
 
 
 def _check_driven_by_lengths(robot: Robot) -> None:

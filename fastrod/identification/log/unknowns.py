@@ -204,6 +204,12 @@ class Model:
         return replace(self.robot_at(theta), effects=tuple(tables), fit={}, sensor={})
 
 
+    def in_sessions(self, theta: Floats) -> tuple[Robot, ...]:
+        """The robot as `identified` in each session; once, where none has anything of its own."""
+        count = len(self.sessions) if any(u.session for u in self.unknowns) else 1
+        return tuple(self.identified(theta, k) for k in range(count))
+
+
 def known_model(robot: Robot) -> Model:
     """A robot with its own effects, nothing unknown."""
     return Model(robot, route(robot), tuple(named_effects(robot)), ())

@@ -68,32 +68,34 @@ class MotionRod:
     of_modes: ClassVar[bool] = False
     _known: dict[str, PredictedPose] = field(default_factory=dict)
 
-    def poses(self, robots: Sequence[Robot]) -> list[PredictedPose]:
-        """What the camera sees of each of these robots."""
-        new = {repr(robot): robot for robot in robots if repr(robot) not in self._known}
+    def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
+        """What the camera sees of each of these robots, as it is in every session."""
+        new = {repr(each): each for each in robots if repr(each) not in self._known}
         for keys, batch in _batches(new):
             replay = MotionReplay(
                 self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
             )
             self._known |= zip(keys, replay.poses(batch), strict=True)
             self.runs += 1
-        return [self._known[repr(robot)] for robot in robots]
+        return [self._known[repr(each)] for each in robots]
 
 
-def _batches(robots: dict[str, Robot]) -> Iterator[tuple[list[str], list[Robot]]]:
+def _batches(
+    robots: dict[str, tuple[Robot, ...]],
+) -> Iterator[tuple[list[str], list[tuple[Robot, ...]]]]:
     """Robots that may move side by side: with the same effects, neutral where one has none, and the same
     geometry, which effects need; those whose effects go by what the rod does, which takes longer, apart."""
-    some = any(robot.effects for robot in robots.values())
+    some = any(every[0].effects for every in robots.values())
     alike: dict[object, list[str]] = {}
-    for key, robot in robots.items():
+    for key, (robot, *_) in robots.items():
         slow = tuple(name for name in named_effects(robot) if _follows(name))
         alike.setdefault((slow, _geometry(robot) if some else None), []).append(key)
     for keys in alike.values():
-        names = {name for key in keys for name in named_effects(robots[key])}
+        names = {name for key in keys for name in named_effects(robots[key][0])}
         order = [name for name in effect_names() if name in names]
         for first in range(0, len(keys), _MOST):
             batch = keys[first : first + _MOST]
-            yield batch, [_with_effects(robots[key], order) for key in batch]
+            yield batch, [tuple(_with_effects(robot, order) for robot in robots[key]) for key in batch]
 
 
 def _follows(name: str) -> bool:
@@ -153,7 +155,7 @@ class MotionModel:
     @cached_property
     def pose(self) -> PredictedPose:
         """What the camera sees."""
-        return self.rod.poses([self.model.identified(self.theta)])[0]
+        return self.rod.poses([self.model.in_sessions(self.theta)])[0]
 
     def under(self, target: Target) -> MotionModel:
         """The same, weighed otherwise."""
@@ -169,7 +171,7 @@ class MotionModel:
         """(n, n_out) weighted; infinite where no robot has these numbers, or it is lost on the way."""
         shape = (len(self.samples.rows), 3 + 3 * (self.target.rotation is not None))
         try:
-            (pose,) = self.rod.poses([model.identified(theta)])
+            (pose,) = self.rod.poses([model.in_sessions(theta)])
         except RobotError:
             return np.full((shape[0], shape[1] + 3 * self.target.points.shape[1]), np.inf)
         found = self.target.residual(pose)
@@ -182,7 +184,7 @@ class MotionModel:
         n_known = 0 if known is None else known.shape[-1]
         steps = _steps(model, theta)
         moved = (theta + np.diag(steps))[n_known:]
-        self.rod.poses([model.identified(each) for each in moved])
+        self.rod.poses([model.in_sessions(each) for each in moved])
         every = [
             np.nan_to_num((residual - self.residual(model, each)) / step, posinf=0.0, neginf=0.0)
             for each, step in zip(moved, steps[n_known:], strict=True)
@@ -198,7 +200,7 @@ class MotionModel:
             first = known.shape[-1] if known is not None and _moves_geometry(model) else 0
             moved = (theta + np.diag(_steps(model, theta)))[first:]
             with suppress(RobotError):  # a trial that is no robot is a worse one
-                self.rod.poses([model.identified(each) for each in (theta, *moved)])
+                self.rod.poses([model.in_sessions(each) for each in (theta, *moved)])
             return self.residual(model, theta)
 
         def slopes(theta: Floats, r: Floats) -> Floats:
@@ -217,7 +219,7 @@ class MotionSearch(Search):
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
         """What the camera sees at the rows of `samples`."""
-        return MotionRod(samples, self.rod.points, self.rod.threads).poses([model.identified(theta)])[0]
+        return MotionRod(samples, self.rod.points, self.rod.threads).poses([model.in_sessions(theta)])[0]
 
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
         """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
@@ -250,7 +252,7 @@ class MotionSearch(Search):
         """The candidates that promise most, fitted; of the others, that they promise too little."""
         self.report("what each does")
         n, models = len(state.model.unknowns), {name: state.model.with_effect(name) for name in names}
-        every: list[Robot] = []
+        every: list[tuple[Robot, ...]] = []
         for name, model in models.items():
             sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
             at_zero = np.concatenate([state.theta, model.start[n:]])
@@ -260,7 +262,7 @@ class MotionSearch(Search):
             for start in _starts(state, model, name):
                 thetas.append(start)
                 thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
-            every += [model.identified(theta) for theta in thetas]
+            every += [model.in_sessions(theta) for theta in thetas]
         quick = MotionRod(self.samples, self.rod.points, self.rod.threads, _QUICK * self.rod.longest_step)
         quick.poses(every)
         near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
@@ -289,12 +291,6 @@ class MotionSearch(Search):
         with np.errstate(invalid="ignore"):
             found = super()._promise(state, model, theta)
         return found if np.isfinite(found) else 0.0
-
-    def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
-        every = _starts(state, model, name)
-        theta = max(every, key=lambda theta: self._promise(state, model, theta))
-        known = state.fit.slopes[..., : len(state.model.unknowns)]
-        return state.linearised.fit(model, theta, _ITERATIONS, known)
 
 
 def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
@@ -326,7 +322,7 @@ def fit_motion(
     points = samples.log.points is not None and bool(robot.log_points)
     report("motion as given")
     whole = MotionRod(samples, points, threads)
-    (pose,) = whole.poses([model.identified(model.start)])
+    (pose,) = whole.poses([model.in_sessions(model.start)])
     if not pose.ok.all():
         k = int(samples.rows[np.flatnonzero(~pose.ok)[0]])
         run = str(samples.log.run[k]) or samples.log.name
@@ -355,7 +351,7 @@ def fit_motion(
         moving = MotionModel(model, theta, within, rod, own)
         fit = moving.fit(model, theta, 10)
         theta, solves = fit.theta, solves + rod.runs * (rod is not whole)
-        (pose,) = whole.poses([model.identified(theta)])
+        (pose,) = whole.poses([model.in_sessions(theta)])
         left = np.where(pose.ok[:, None], target.tip - pose.position, left)
         noise = _noise(samples, robot, left)
     out = int((own.weight == 0.0).sum())

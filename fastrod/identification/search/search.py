@@ -290,7 +290,7 @@ class Search:
             shown_by = trait(get_effect(name), "excited_by") or "no response"
             return unfitted(name, f"this log does not excite it: {shown_by}")
         model = state.model.with_effect(name, drop=drop, drive=drive)
-        fits = self._fromstarts_of(state, model, name)
+        fits = self._from_starts(state, model, name)
         if fits is None:
             n_more = len(model.unknowns) - len(state.model.unknowns)
             return unfitted(name, "its slopes promise nothing", n_more)
@@ -316,7 +316,7 @@ class Search:
                 unseen.append(u.name.partition(".")[2])
         return unseen
 
-    def _fromstarts_of(self, state: ModelState, model: Model, name: str) -> Fit | None:
+    def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
         linearised, n = state.linearised, len(state.model.unknowns)
         amplitudes = state.fit.theta[n:]
         promising = [(self._promise(state, model, theta), theta) for theta in starts_of(state, model, name)]
