@@ -39,6 +39,7 @@ GIVEN: dict[str, dict[str, Any]] = {
     "plastic_set": {"share": 0.2, "yield_at": 0.3},
     "second_order_lag": {"period": 0.08, "damping": 0.2},
     "time_drift": {"x": 1e-4, "y": -2e-4, "z": 5e-5},
+    "rotation_drift": {"x": 2e-3, "y": -1e-3, "z": 4e-3},
     "settling_drift": {"x": 1e-3, "y": -2e-3, "z": 5e-4, "time_constant": 5.0},
 }
 TABLES: dict[str, dict[str, Any]] = {

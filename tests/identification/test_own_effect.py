@@ -120,6 +120,7 @@ def test_every_law_of_the_library_has_what_it_had() -> None:
         "temperature": Signal.TIME,
         "time_drift": Signal.TIME,
         "settling_drift": Signal.TIME,
+        "rotation_drift": Signal.TIME,
         "slip": Signal.TIME,
         "tip_force": Signal.FORCE,
         "tip_spring": Signal.TIP,

@@ -20,12 +20,13 @@ FRICTION = {"name": "friction", "half_width": 3e-4, **RUBS}
 CAPSTAN = {"name": "capstan_friction", "mu": 0.35, **RUBS}
 LINEAR = {"name": "time_drift", "x": 1.5e-5, "y": -2e-5, "z": 1e-5}
 SETTLING = {"name": "settling_drift", "x": 2e-3, "y": -3e-3, "z": 1e-3, "time_constant": 30.0}
+ROTATING = {"name": "rotation_drift", "x": 1e-4, "y": -2e-4, "z": 3e-4}
 
 
 @cache
 def found(name: str) -> Result:
     """What is found in a run of 150 s whose camera drifts."""
-    sealed: dict[str, Any] = {"time_drift": LINEAR, "settling_drift": SETTLING}[name]
+    sealed: dict[str, Any] = {each["name"]: each for each in (LINEAR, SETTLING, ROTATING)}[name]
     robot = one_segment()
     log = log_of(robot, wave(robot, 500, dt=0.3), 0.3)
     tip = replay(log, replace(robot, effects=(sealed,))).tip_position
@@ -34,17 +35,17 @@ def found(name: str) -> Result:
 
 
 @pytest.mark.study
-def test_a_drift_that_settles_is_told_from_one_that_goes_on() -> None:
-    result = found("settling_drift")
+@pytest.mark.parametrize("sealed", [SETTLING, ROTATING], ids=lambda sealed: sealed["name"])
+def test_a_drift_of_another_form_is_told_from_one_that_goes_on(sealed: dict[str, Any]) -> None:
+    result = found(sealed["name"])
     (effect,) = result.effects
-    assert effect.name == "settling_drift"
+    assert effect.name == sealed["name"]
     assert "time_drift" not in effect.cannot_be_told_from
     assert result.verdict == "explained"
     assert result.test.before > 2.0 * result.noise.floor
     assert result.test.after < 1.1 * result.noise.floor
-    for name in ("x", "y", "z", "time_constant"):
-        estimate = effect.parameters[name]
-        assert estimate.value == pytest.approx(SETTLING[name], abs=4.0 * estimate.stderr)
+    for name, estimate in effect.parameters.items():
+        assert estimate.value == pytest.approx(sealed[name], abs=4.0 * estimate.stderr)
         assert estimate.stderr < 0.2 * abs(estimate.value)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
-from fastrod.rotation import matrix_from_quaternion
+from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod.types import Floats
 
 _REVOLUTION = 2.0 * np.pi  # rad: any rotation, and a fit may pass half a turn
@@ -40,15 +40,7 @@ class FrameMisalignment(Static):
     synonyms = ("registration",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        rotation = _rotation(values[:, :3])
+        rotation = matrix_from_quaternion(quaternion_from_vector(values[:, :3]))
         ports.tip_position[:] = np.einsum("nij,nj->ni", rotation, ports.tip_position) + values[:, 3:]
         ports.tip_rotation[:] = rotation @ ports.tip_rotation
         ports.points[:] = np.einsum("nij,nkj->nki", rotation, ports.points) + values[:, None, 3:]
-
-
-def _rotation(vector: Floats) -> Floats:
-    """(n, 3, 3) rotation by a rotation vector (n, 3) [rad]."""
-    half = 0.5 * np.linalg.norm(vector, axis=1)
-    return matrix_from_quaternion(
-        np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector])
-    )
