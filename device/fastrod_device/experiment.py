@@ -15,7 +15,8 @@ from fastrod.control.inverse import InversePlan
 from fastrod.errors import InputError
 from fastrod.identification.excite import Excitation
 from fastrod.logs.recording import Recorder
-from fastrod.logs.runlog import RunLog, numbers
+from fastrod.logs.runlog import RunLog
+from fastrod.logs.table import numbers
 from fastrod.types import Flags, Floats
 from fastrod_device.prototype import Prototype
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import NoReturn
 
+from fastrod.commands import own
 from fastrod.commands.overview import overview
 from fastrod.errors import UnknownNameError, nearest
 
@@ -350,6 +351,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         metavar="GROUP",
         help="rod, contact (with what it needs of the rod), modes (default: all)",
     )
+    own.add_commands(commands)
     parser.commands = {action.dest: action.help or "" for action in commands._get_subactions()}
     return parser, list(commands.choices)
 

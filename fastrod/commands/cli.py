@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fastrod.commands import own
 from fastrod.commands.arguments import BOARD_ACTIONS, DATA_SETS, UsageError, build, check_drive
 from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
 
@@ -415,6 +416,9 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "replay": _replay,
     "identify": _identify,
     "excite": _excite,
+    "new": own.new,
+    "import": own.bring,
+    "check": own.check,
     "view": _view,
     "drive": _drive,
     "envs": _envs,

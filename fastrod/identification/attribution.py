@@ -14,6 +14,7 @@ from dataclasses import replace
 from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
 from fastrod.identification.log.base_model import base_model
+from fastrod.identification.log.clock import MARGIN, clock_offset
 from fastrod.identification.log.questions import read, time_question
 from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
@@ -21,6 +22,7 @@ from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.assemble import assemble, explain, verdict_on
 from fastrod.identification.report.motion import named
 from fastrod.identification.report.result import Result
+from fastrod.identification.report.wording import with_error
 from fastrod.identification.search.base import BaseFit, check_motion, fit_base
 from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
 from fastrod.identification.search.motion import DAMPING, INERTIA, damped, fit_motion
@@ -28,7 +30,7 @@ from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
-from fastrod.logs.runlog import RunLog
+from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.solver.motion import solver_of
 from fastrod.threads import one_blas_thread
@@ -93,10 +95,14 @@ def identify(
     if network:
         check_network()
     progressed, most = progress or (lambda *_: None), max_effects + _SPARE + 2
-    log = split([logs] if isinstance(logs, RunLog) else list(logs), robot, held_out)
+    every = [logs] if isinstance(logs, RunLog) else list(logs)
+    log = split(every, robot, held_out)
     # refuses a wrong [fit] before anything is solved
     model = base_model(
-        robot, free_camera=free_camera, dynamics=dynamics, sessions=log.samples.sessions if dynamics else ("",)
+        robot,
+        free_camera=free_camera,
+        dynamics=dynamics,
+        sessions=log.samples.sessions if dynamics else ("",),
     )
     if dynamics:
         return _in_motion(
@@ -105,6 +111,8 @@ def identify(
     if max_effects and (found := _rings(log, robot, progressed, threads)):
         return found
     progressed("registration", 0, most)
+    if clock := clock_offset(log.samples, robot, threads):
+        log = split([on_one_clock(one, clock + MARGIN) for one in every], robot, held_out)
     some = log.samples.on(thinned(log.rows, _FEW_ROWS))
     reading = read(some, robot, threads=threads)
     if reading.refusal:
@@ -117,6 +125,7 @@ def identify(
             seen,
             free_camera=free_camera,
             registered=moved,
+            margin=MARGIN if clock else 0.0,
             sessions=log.samples.sessions,
             only_session=only_session,
         )
@@ -138,10 +147,34 @@ def identify(
         at = between(robot, result.identified)
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
+    if clock:
+        result = _on_one_clock(result, clock)
     return (
         replace(result, network=residual_network(log.samples, base.start.model.wiring, result))
         if network
         else result
+    )
+
+
+def _on_one_clock(result: Result, laid: float) -> Result:
+    """The result of a log whose commands were laid on the camera's clock `laid` + `MARGIN` [s] earlier: the
+    delay that is fitted is what is left of that."""
+    delay = result.base_parameters["latency.delay"]
+    offset = replace(delay, value=laid + MARGIN - delay.value)
+    sentence = (
+        f"The commands stand {with_error(offset.value, offset.stderr, 's')} later in the log than they "
+        "acted: two clocks; all errors are given with both on one."
+    )
+
+    def clocked(robot: Robot) -> Robot:
+        return replace(robot, log=replace(robot.log, clock=robot.log.clock + laid + MARGIN))
+
+    return replace(
+        result,
+        clock=offset,
+        identified=clocked(result.identified),
+        sessions={label: clocked(robot) for label, robot in result.sessions.items()},
+        summary=f"{result.summary} {sentence}",
     )
 
 
@@ -173,7 +206,9 @@ def _rings(
     log = log.swings
     progressed("base fit", 0, 1)
     some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
-    still = fit_base(some, log.rows, base_model(robot, sessions=log.samples.sessions), robot, frozenset(), threads)
+    still = fit_base(
+        some, log.rows, base_model(robot, sessions=log.samples.sessions), robot, frozenset(), threads
+    )
     progressed("inertia and damping", 0, 1)
     moved = damped(robot)
     model = base_model(moved, dynamics=True, sessions=log.samples.sessions)

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from fastrod.errors import InputError, LogError, nearest
 from fastrod.logs.linefile import append_lines, is_at, made_again
 from fastrod.logs.link import Measurement
-from fastrod.logs.runlog import RunLog, numbers, read_table, write_log
+from fastrod.logs.runlog import RunLog, write_log
+from fastrod.logs.table import numbers, read_table
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 

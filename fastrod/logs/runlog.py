@@ -6,21 +6,19 @@ import csv
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import LogError, UnknownNameError, nearest
+from fastrod.logs.columns import translated
+from fastrod.logs.table import Table, arrow, numbers, read_table
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot, robot_names
 from fastrod.model.routing import route
 from fastrod.types import Floats
-
-Table: TypeAlias = dict[str, Sequence[str] | Floats]
 
 _TIP = ("tip_x", "tip_y", "tip_z")
 _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
@@ -28,9 +26,8 @@ _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 _LONGEST_MOVE = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
 _FAR = 30.0  # robot lengths; no camera that sees the robot is further off
+_COUNTED_FROM = 0.25  # of the robot's length, by all tendons alike: no robot is pulled or paid out so far
 _LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
-# of a Parquet file unpacked: 1.5 GB at its peak; the bytes of a CSV, too
-_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -151,15 +148,17 @@ class RunLog:
 
 
 def read_log(path: str | Path, robot: Robot) -> RunLog:
-    """The run log at `path` (.csv or .parquet) for `robot`, checked against it.
+    """The run log at `path` (.csv, .parquet or .mat) for `robot`, checked against it.
+
+    A file with columns of its own is translated as `[log]` of the robot file says.
 
     Lines of a CSV that start with # are comments. Rows count from 1 after the header.
     Raises `LogError`, one sentence with row and column, for a file that cannot be read or that does not fit
     the robot.
     """
     path = Path(path)
-    table = read_table(path)
     where = path.name
+    table = translated(read_table(path), robot.log, where)
     n = len(next(iter(table.values())))
     if n == 0:
         raise LogError(f"{where} has a header but no rows.")
@@ -197,8 +196,26 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
         extra={name: cells for name, cells in table.items() if name not in known | {"run", "session"}},
     )
     _check_time(log, where)
+    log = on_one_clock(log, robot.log.clock)
     _check_units(log, robot, where)
     return log
+
+
+def on_one_clock(log: RunLog, clock: float) -> RunLog:
+    """The log with its commands laid on the clock of what was measured: those of time t stand in the row of
+    t + `clock` [s]."""
+    if not clock:
+        return log
+    names = [name for name in ("dl", "pos", "ext") if getattr(log, name) is not None]
+    made = {name: getattr(log, name).copy() for name in names}
+    for label in log.runs:
+        own = (log.run == label) & np.isfinite(log.t)
+        for values in made.values():
+            for column in values.T:
+                rows = own & np.isfinite(column)
+                if rows.any():
+                    column[own] = np.interp(log.t[own] + clock, log.t[rows], column[rows])
+    return replace(log, **made)
 
 
 def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
@@ -211,8 +228,8 @@ def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
     partial = path.with_name(path.name + ".part")
     table = None
     if path.suffix == ".parquet":
-        table = _pyarrow("pyarrow").table({name: np.asarray(cells) for name, cells in columns.items()})
-        write_table = _pyarrow("pyarrow.parquet").write_table
+        table = arrow("pyarrow").table({name: np.asarray(cells) for name, cells in columns.items()})
+        write_table = arrow("pyarrow.parquet").write_table
     file = partial.open("wb")
     try:
         with file, TextIOWrapper(file, encoding="utf-8", newline="") as text:
@@ -227,158 +244,6 @@ def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
     except BaseException:
         partial.unlink(missing_ok=True)  # it takes room on a disk that is full
         raise
-
-
-def read_table(path: str | Path) -> Table:
-    """The columns of a .csv or .parquet by name, not interpreted: texts of a CSV, numbers of a Parquet file.
-
-    Raises `LogError` for a file that is not there, is empty, or whose rows do not fit its header.
-    """
-    path = Path(path)
-    try:
-        if path.exists() and not path.is_file():  # a pipe or a device may have no end
-            raise ValueError("it is no file")
-        return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
-    except LogError:
-        raise
-    # ValueError: bytes that are no text, or a path that no file can have
-    except (OSError, ValueError, csv.Error) as error:
-        why = (
-            "it is not text"
-            if isinstance(error, UnicodeDecodeError)
-            else getattr(error, "strerror", None) or str(error)
-        )
-        raise LogError(f"log {str(path)!r} cannot be read: {why}.") from error
-
-
-def numbers(table: Table, name: str, where: str) -> Floats:
-    """(n,) floats of the column `name`; an empty cell is nan. `where` names the file in errors
-    (`LogError`)."""
-    cells = table[name]
-    if isinstance(cells, np.ndarray):
-        values = cells
-    else:
-        try:
-            values = np.array([float(cell or "nan") for cell in cells])
-        except ValueError:
-            values = np.array([_number(cell, row, name, where) for row, cell in enumerate(cells, 1)])
-    if np.isinf(values).any():
-        row = int(np.argmax(np.isinf(values)))
-        raise LogError(
-            f"{where} row {row + 1}, column {name} is {values[row]}; it must be finite, or empty "
-            "where it is missing."
-        )
-    return values
-
-
-def _read_csv(path: Path) -> Table:
-    if (size := path.stat().st_size) > _MOST_BYTES:
-        raise LogError(f"{path.name} has {size} bytes; a log may have {_MOST_BYTES}. Cut it in parts.")
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
-    if not rows:
-        raise LogError(
-            f"{path.name} is empty; a run log starts with a header such as t,dl_1,tip_x,tip_y,tip_z."
-        )
-    header = [name.strip() for name in rows[0]]
-    if len(header) == 1 and ";" in header[0]:
-        raise LogError(
-            f"{path.name} is separated by semicolons; a run log is separated by commas, with decimal points."
-        )
-    _check_header(header, path.name)
-    for number, row in enumerate(rows[1:], 1):
-        if len(row) != len(header):
-            raise LogError(
-                f"{path.name} row {number} has {len(row)} values; the header names {len(header)} columns."
-            )
-    return dict(
-        zip(header, zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(header), strict=True)
-    )
-
-
-def _check_header(header: list[str], where: str) -> None:
-    twice = sorted({name for name in header if header.count(name) > 1})
-    if twice:
-        raise LogError(f"{where} has column {twice[0]!r} more than once; each name stands for one column.")
-
-
-def _read_parquet(path: Path) -> Table:
-    parquet, arrow = _pyarrow("pyarrow.parquet"), _pyarrow("pyarrow")
-    table: Table = {}
-    try:
-        with parquet.ParquetFile(path) as file:
-            _check_declared(file.metadata, path.name)
-            words = [column.path for column in file.metadata.schema if column.physical_type == "BYTE_ARRAY"]
-        content = parquet.read_table(path, read_dictionary=words)  # a word of a million rows is held once
-        _check_header(content.column_names, path.name)
-        for name in content.column_names:
-            column = content.column(name)
-            _check_words(column, path.name)
-            try:
-                cells = column.to_pylist()
-            except ValueError:  # times finer than Python's
-                cells = column.cast("string").to_pylist()
-            table[name] = _cells(cells)
-    except arrow.ArrowException as error:
-        raise LogError(
-            f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}."
-        ) from error
-    if not table:
-        raise LogError(f"{path.name} has no columns.")
-    return table
-
-
-def _check_declared(metadata: Any, where: str) -> None:
-    """Raise `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of
-    rows."""
-    chunks = [
-        metadata.row_group(k).column(j)
-        for k in range(metadata.num_row_groups)
-        for j in range(metadata.row_group(k).num_columns)
-    ]
-    n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
-    n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
-    if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
-        raise LogError(
-            f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of "
-            f"{_MOST_BYTES} bytes. Split it."
-        )
-
-
-def _check_words(column: Any, where: str) -> None:
-    """Raise `LogError` where words that are held once would be too much as cells."""
-    compute, n_bytes = _pyarrow("pyarrow.compute"), 0
-    for chunk in column.chunks:
-        if hasattr(chunk, "dictionary") and len(chunk):
-            n_bytes += (
-                compute.sum(compute.take(compute.binary_length(chunk.dictionary), chunk.indices)).as_py() or 0
-            )
-    if n_bytes > _MOST_BYTES:
-        raise LogError(
-            f"{where} declares a column of {n_bytes} bytes of text; a log may have {_MOST_BYTES}. Split it."
-        )
-
-
-def _cells(cells: Sequence[Any]) -> Sequence[str] | Floats:
-    """A column as numbers; as texts, where it holds anything else, such as texts, times or lists."""
-    try:
-        if not any(isinstance(cell, (str, bytes)) for cell in cells):
-            values = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
-            if values.shape == (len(cells),):
-                return values
-    except (TypeError, ValueError, OverflowError):
-        pass
-    return ["" if cell is None else str(cell) for cell in cells]
-
-
-def _pyarrow(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise LogError(
-            "a .parquet log needs the package pyarrow, which is not installed; install it, or "
-            "give the log as .csv."
-        ) from error
 
 
 def _need(table: Table, names: Sequence[str], where: str, why: str) -> None:
@@ -476,16 +341,6 @@ def _labels(table: Table, n: int, name: str) -> NDArray[np.str_]:
     return np.array([str(cell).strip() for cell in cells])
 
 
-def _number(cell: str, row: int, name: str, where: str) -> float:
-    try:
-        return float(cell.strip() or "nan")
-    except ValueError:
-        raise LogError(
-            f"{where} row {row}, column {name} is {cell!r}; it must be a number, or empty where "
-            "it is missing."
-        ) from None
-
-
 def _unit(quaternion: Floats | None, names: Sequence[str], where: str) -> Floats | None:
     """`quaternion` (n, 4) scaled to norm 1, after a check that it was near."""
     if quaternion is None:
@@ -578,19 +433,26 @@ def _measured(log: RunLog) -> Iterator[tuple[str, Floats]]:
 
 
 def _check_changes(log: RunLog, robot: Robot, where: str) -> None:
-    """Refuse absolute tendon lengths in place of their changes: every one about as long as at rest, on a
-    robot that cannot grow so far."""
+    """Refuse lengths that are no changes against the straight robot, on a robot that cannot grow so far:
+    absolute ones, about as long as at rest, and those that are counted from elsewhere."""
     rest = np.asarray(robot.rest_tendon_length)
-    if not rest.size or not np.isfinite(log.dl).all(axis=1).any():
+    grows = sum(segment.extension[1] for segment in robot.segments)
+    if not rest.size or not np.isfinite(log.dl).all(axis=1).any() or grows >= 0.5 * robot.length:
         return
     usual = np.nanmedian(log.dl, axis=0)
-    grows = sum(segment.extension[1] for segment in robot.segments)
-    if (np.abs(usual - rest) < _LIKE_REST * rest).all() and grows < 0.5 * robot.length:
+    common = float(usual.mean())
+    if (np.abs(usual - rest) < _LIKE_REST * rest).all():
         raise LogError(
             f"{where} has a median of {usual[0]:.4g} m in column dl_1, where robot {robot.name!r} has a "
             f"tendon of {rest[0]:.4g} m at rest: "
             "these look like absolute lengths. The log takes changes against the straight robot, negative = "
             "pulled."
+        )
+    if abs(common) > _COUNTED_FROM * robot.length and np.ptp(usual) < 0.5 * abs(common):
+        raise LogError(
+            f"{where} has about {common:.4g} m in every dl_ column: are they counted from another length "
+            f"than that of the straight robot? [log] columns and offset = {common:.4g} in the file of robot "
+            f"{robot.name!r} take it off."
         )
 
 

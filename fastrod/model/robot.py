@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import RobotError, nearest
+from fastrod.model.logformat import LogFormat
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
 """Boundary mode of a segment: what is prescribed at its end (Rucker and Webster 2011; `paper`: SoftManiSim,
@@ -252,6 +253,8 @@ class Robot:
     the usual. A host in whose world it is another refuses it."""
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
+    log: LogFormat = field(default_factory=LogFormat)
+    """Columns, units and signs of this robot's own log files (contracts: `[log]`)."""
     effects: tuple[Mapping[str, Any], ...] = ()
     """What a robot file adds to the rod (contracts: `[[effect]]`): a name, and the effect's parameters."""
     fit: Mapping[str, Mapping[str, float | bool]] = field(default_factory=dict)

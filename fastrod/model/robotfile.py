@@ -15,9 +15,11 @@ import msgspec
 import tomli_w
 
 from fastrod.errors import RobotError, UnknownNameError, nearest, shown
+from fastrod.model.logformat import LogFormat
 from fastrod.model.robot import MODES, Lump, Robot, Segment, Tendon
 from fastrod.tomlfile import parse, read_text
 
+_LOG = tuple(f.name for f in fields(LogFormat))
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
 _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
 
@@ -66,13 +68,15 @@ def loads(text: str, where: str = "robot file") -> Robot:
         raise RobotError(f"{where}: segment is one table; write [[segment]], in double brackets.")
     base = _section(data, "base", ("position", "quaternion"), where)
     world = _section(data, "world", ("gravity",), where)
-    log = _section(data, "log", ("points",), where)
+    log = _section(data, "log", ("points", *_LOG), where)
+    points = log.pop("points", None)
     optional = {
         "base_position": base.get("position"),
         "base_quaternion": base.get("quaternion"),
         "gravity": world.get("gravity"),
         "states_gravity": True if "gravity" in world else None,
-        "log_points": log.get("points"),
+        "log_points": points,
+        "log": log or None,
         "effects": data.get("effect"),
         "fit": data.get("fit"),
         "sensor": _section(data, "sensor", _SENSOR, where) or None,
@@ -100,13 +104,14 @@ def dumps(robot: Robot) -> str:
         data["world"] = {"gravity": list(robot.gravity)}
     if robot.effects:
         data["effect"] = [dict(effect) for effect in robot.effects]
-    if robot.log_points:
-        data["log"] = {"points": list(robot.log_points)}
+    log = {"points": list(robot.log_points)} if robot.log_points else {}
+    default = LogFormat()
+    own = {key: getattr(robot.log, key) for key in _LOG if getattr(robot.log, key) != getattr(default, key)}
+    if log | own:
+        data["log"] = log | _listed(own)
     for section in ("fit", "sensor"):
         if content := getattr(robot, section):
-            data[section] = {
-                key: dict(value) if isinstance(value, Mapping) else value for key, value in content.items()
-            }
+            data[section] = _listed(content)
     return tomli_w.dumps(data)
 
 
@@ -178,9 +183,16 @@ def _written(segment: Segment) -> dict[str, Any]:
     return data
 
 
+def _listed(value: Any) -> Any:
+    """Tables and tuples as TOML has them."""
+    if isinstance(value, Mapping):
+        return {key: _listed(each) for key, each in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
 def _plain_table(each: Segment | Tendon | Lump) -> dict[str, Any]:
     values = {f.name: getattr(each, f.name) for f in fields(each)}
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+    return {key: _listed(value) for key, value in values.items()}
 
 
 def _section(data: Mapping[str, Any], name: str, known: Iterable[str], where: str) -> dict[str, Any]:
@@ -199,6 +211,7 @@ _TYPES: dict[str, Any] = {
     "gravity": tuple[float, float, float],
     "states_gravity": bool,
     "log_points": tuple[float, ...],
+    "log": LogFormat,
     "fit": dict[str, dict[str, float | bool]],
     "sensor": dict[str, float | tuple[float, ...]],
 }
@@ -211,7 +224,9 @@ def _convert(value: Any, key: str, where: str, kind: Any = None) -> Any:
             return tuple(value)
         made = msgspec.convert(value, kind or _TYPES[key])
     except msgspec.ValidationError as error:
-        raise RobotError(f"{where}: {key}: {_plain(error)}") from error
+        sentence = _plain(error)
+        named = "" if sentence.startswith("[") else "[log] " if key == "log" else f"{key}: "
+        raise RobotError(f"{where}: {named}{sentence}") from error
     if isinstance(made, float) and not math.isfinite(made):
         raise RobotError(f"{where}: {key} is {made}; it must be finite.")
     return made

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import InputError, LogError, nearest
-from fastrod.logs.runlog import RunLog, Table, numbers, read_log, read_table
+from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.table import Table, numbers, read_table
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.robotfile import load_robot
 
@@ -369,7 +370,8 @@ def read(path: str | Path, given: Robot | None) -> tuple[RunLog, Robot]:
     set's; `LogError` as the readers.
     """
     path = Path(path)
-    if adapter := detect(path):
+    own = given is not None and bool(given.log.columns)
+    if not own and (adapter := detect(path)):
         log, robot = adapter(path)
         if given is not None and given.n_tendons != robot.n_tendons:
             raise InputError(

@@ -401,7 +401,7 @@ def test_a_pipe_that_nobody_writes_into_is_refused(name: str, tmp_path: Path) ->
 
 def test_a_csv_has_a_most_of_bytes(tmp_path: Path, monkeypatch: Any, originals: Originals) -> None:
     (tmp_path / "log.csv").write_bytes(originals.log[0])
-    monkeypatch.setattr("fastrod.logs.runlog._MOST_BYTES", 100)
+    monkeypatch.setattr("fastrod.logs.table._MOST_BYTES", 100)
     with pytest.raises(LogError, match=r"log\.csv has \d+ bytes; a log may have 100\. Cut it in parts\.$"):
         read_log(tmp_path / "log.csv", PROTOTYPE)
 

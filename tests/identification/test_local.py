@@ -106,7 +106,9 @@ def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.nda
 # seen): tendons go through the rod by one-sided differences of 2 mrad, the camera by none;
 LENGTHS = "drum_gain encoder_offset coupling slack stiffening temperature tendon_interaction"
 TENDONS = dict.fromkeys(LENGTHS.split(), 0.004)
-CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift", "rotation_drift"], 1e-4)
+CAMERA = dict.fromkeys(
+    ["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift", "rotation_drift"], 1e-4
+)
 # but for a time constant, by a one-sided difference of 2e-3 of its logarithm;
 CAMERA |= {"settling_drift": 1e-3}
 # a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a

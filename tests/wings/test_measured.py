@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
 from fastrod.identification.log.base_model import base_model
-from fastrod.logs.runlog import read_log, read_table, write_log
+from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.table import read_table
 from fastrod.model.robotfile import dumps, loads
 from fastrod.model.routing import route
 from fastrod_scenes import measured

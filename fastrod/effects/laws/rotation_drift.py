@@ -33,7 +33,9 @@ class RotationDrift(Static):
     excited_by = "bent poses in several directions, revisited at the end"
     confounded_with = ("time_drift", "temperature", "creep")
     refines = "time_drift"
-    separated_by: ClassVar[Mapping[str, str]] = {"time_drift": "poses bent to both sides, revisited at the end"}
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "time_drift": "poses bent to both sides, revisited at the end"
+    }
     signal = Signal.TIME
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:

@@ -59,42 +59,54 @@ def why_unknown(name: str, samples: LogSamples, robot: Robot) -> str:
 def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
     """What this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2) commanded
     [rad]."""
+    return [cannot for there, _, cannot in excitation(samples, bend) if not there]
+
+
+def excitation(samples: LogSamples, bend: Floats) -> list[tuple[bool, str, str]]:
+    """Each kind of excitation: whether the run has it, what it shows, and what is not seen without it. `bend`
+    (n, n_segments, 2) commanded [rad]."""
     log = samples.log
-    lacks = []
-    if not _base_rotates(log.base_quaternion):
-        lacks.append(
-            "one base orientation only: gravity and payload cannot be distinguished from zeros, "
-            "registration or precurvature"
-        )
-    if log.payload is None and log.tip_force is None:
-        lacks.append(
-            "no known load: stretch of the tendons cannot be distinguished from the gain of the drives, "
-            "stiffness is not seen"
-        )
     size = np.linalg.norm(bend, axis=-1)
-    if size.size and float(size.max()) < 0.45:
-        lacks.append(
-            f"bends to {np.degrees(size.max()):.0f} degrees only: stiffening, taper, compression "
-            "and a set hardly show"
-        )
+    largest = float(size.max()) if size.size else np.inf
     holds = [
         rows
         for rows in at_rest(samples)
         if samples.time[samples.rows[rows[-1]]] - samples.time[samples.rows[rows[0]]] >= 2.0
     ]
-    if not holds:
-        lacks.append(
-            "no holds: creep cannot be distinguished from friction, and the noise is not known from rest"
-        )
-    if bend.shape[1] > 1:
-        moved = size > 0.1
-        if not any(
-            (moved[:, k] & ~np.delete(moved, k, axis=1).any(1)).mean() > 0.03 for k in range(bend.shape[1])
-        ):
-            lacks.append(
-                "no segment ever moves alone: coupling between segments looks like their own zeros and gains"
-            )
-    return lacks
+    moved = size > 0.1
+    alone = bend.shape[1] < 2 or any(
+        (moved[:, k] & ~np.delete(moved, k, axis=1).any(1)).mean() > 0.03 for k in range(bend.shape[1])
+    )
+    return [
+        (
+            _base_rotates(log.base_quaternion),
+            "several base orientations: gravity and payload apart from zeros and registration",
+            "one base orientation only: gravity and payload cannot be distinguished from zeros, "
+            "registration or precurvature",
+        ),
+        (
+            log.payload is not None or log.tip_force is not None,
+            "known loads: stretch of the tendons apart from the gain of the drives, and stiffness",
+            "no known load: stretch of the tendons cannot be distinguished from the gain of the drives, "
+            "stiffness is not seen",
+        ),
+        (
+            largest >= 0.45,
+            "wide bends: stiffening, taper, compression and a set",
+            f"bends to {np.degrees(largest):.0f} degrees only: stiffening, taper, compression "
+            "and a set hardly show",
+        ),
+        (
+            bool(holds),
+            "holds: creep apart from friction, and the noise",
+            "no holds: creep cannot be distinguished from friction, and the noise is not known from rest",
+        ),
+        (
+            alone,
+            "segments that move alone: coupling apart from zeros and gains",
+            "no segment ever moves alone: coupling between segments looks like their own zeros and gains",
+        ),
+    ]
 
 
 def unique(lines: Sequence[str]) -> list[str]:

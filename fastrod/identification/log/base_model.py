@@ -48,13 +48,15 @@ def base_model(
     dynamics: bool = False,
     sessions: Sequence[str] = ("",),
     only_session: bool = False,
+    margin: float = 0.0,
 ) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness; and of each
     of its `sessions` but the first, its own zeros, registration and delay.
 
-    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. `dynamics`:
-    it is fitted in motion. With `only_session` all is known but what is of a session. Raises `RobotError` for
-    a target that is none, naming the nearest, and for one that only motion shows without it.
+    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. The commands
+    were laid `margin` [s] too early, where that is not 0: about that is the delay, which is fitted.
+    `dynamics`: it is fitted in motion. With `only_session` all is known but what is of a session. Raises
+    `RobotError` for a target that is none, naming the nearest, and for one that only motion shows without it.
     """
     wiring = route(robot)
     unknowns: list[Unknown] = []
@@ -84,11 +86,18 @@ def base_model(
                 )
             )
     sensor = dict(robot.sensor) | (FREE_CAMERA if free_camera else {})
+    if margin:
+        sensor["latency_sd"] = max(float(sensor.get("latency_sd", 0.0)), FREE_CAMERA["latency_sd"])
     if registered:
         sensor["registration_sd"] = _wider(
             sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1])
         )
-    unknowns += _camera(sensor, robot, wiring)
+    unknowns += [
+        replace(u, start=u.mean + margin, mean=u.mean + margin, bounds=(0.0, u.bounds[1] + margin))
+        if margin and u.name == "latency.delay"
+        else u
+        for u in _camera(sensor, robot, wiring)
+    ]
     if only_session:
         unknowns = _of_session(robot, wiring, sensor)
     for k, label in enumerate(sessions[1:], 1):

@@ -158,7 +158,9 @@ def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
     """The log with one more row where each gap ends, as before it and not measured; and the `order` (n,)
     likewise."""
     dt = np.where(log.run[1:] == log.run[:-1], np.diff(log.t), 0.0)
-    usual = {label: np.median(own) for label in log.runs if len(own := dt[(log.run[1:] == label) & (dt > 0.0)])}
+    usual = {
+        label: np.median(own) for label in log.runs if len(own := dt[(log.run[1:] == label) & (dt > 0.0)])
+    }
     step = np.array([usual.get(label, np.inf) for label in log.run[1:]])
     before = np.flatnonzero(dt > _GAP * step)
     if not len(before):

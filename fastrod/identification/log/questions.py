@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict, sample
+from fastrod.identification.log.order import column_order
 from fastrod.identification.log.registration import CameraRegistration, align, size
 from fastrod.identification.log.unknowns import known_model
-from fastrod.logs.runlog import RunLog
+from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats, Ints
@@ -24,6 +26,8 @@ from fastrod.types import Floats, Ints
 _ROWS = 300  # rows that are looked at
 _LEAST = 12  # of them solved; fewer say nothing
 _FOLLOWS = 0.45  # of the motion: a reading that leaves less follows it; 0.55 mm of backlash left 0.18
+# of it: less is an effect's matter; two tendons of different segments exchanged left 0.42
+_CLOSELY = 0.15
 _BETTER = 0.6  # of what is left otherwise: less is another reading's merit
 _LEVER = 0.3  # robot lengths: what a measured rotation counts beside positions
 _STILL = 0.01  # robot lengths: a log that moves less says nothing
@@ -40,6 +44,8 @@ _SCALES = {
     1e3: "converted twice",
 }
 _AS_GOOD = 1.3  # times what a moved camera leaves
+# times as closely by other signs or another order: no effect is that; two tendons exchanged: 9 times
+_MANY = 2.5
 _RIGHT = (
     "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it "
     "this robot?"
@@ -69,29 +75,34 @@ def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple
     if int(log.measured.sum()) < _LEAST:
         return ()
     samples = sample(log)
+    clock = clock_offset(samples, robot, threads)
+    if clock:
+        samples = sample(on_one_clock(log, clock))
     reading = read(samples, robot, threads=threads)
     moved = (
         ()
         if reading.registration is None
         else (f"{reading.registration.sentence()}; fastrod identify takes it from there.",)
     )
-    return (*moved, *reading.questions)
+    late = (f"{clock_sentence(log, clock)}; fastrod identify lays them on one.",) if clock else ()
+    return (*late, *moved, *reading.questions)
 
 
 def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Reading:
     """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
-    late = time_question(samples)
+    late = "" if "time" in robot.log.units else time_question(samples)
     questions = [late] if late else []
     look = _Look(samples, robot, threads)
-    nothing = Reading(registration=None, questions=tuple(questions), refusal="", guess="")
+    nothing = Reading(registration=None, questions=tuple(questions), refusal=late, guess="")
     frame, far = look.frame, look.frame.is_large(robot.length)
     # a small misalignment is for the search to name
     as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)
     if look.motion < _STILL * robot.length or not (look.solved or robot.n_tendons):
         return nothing
-    if as_it_is < _FOLLOWS * look.motion and not far:
+    if as_it_is < _CLOSELY * look.motion and not far:
         return nothing
-    enough = min(_FOLLOWS * look.motion, _BETTER * as_it_is)
+    follows = as_it_is < _FOLLOWS * look.motion and not far
+    enough = as_it_is / _MANY if follows else min(_FOLLOWS * look.motion, _BETTER * as_it_is)
     moved = far and frame.left < enough
     tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
     left, words = min(tried, default=(np.inf, ""))
@@ -101,7 +112,9 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
         mixed_up = left < _AS_GOOD * frame.left and not _declared(robot, frame)
     mirrored = look.mirrored.left < min(enough, _BETTER * frame.left)
     if mirrored and mixed_up:
-        mirrored = look.mirrored.left < _BETTER * left
+        # drives of both signs are rarer than a reversed axis, other readings more frequent
+        plain = "the sign of dl_" not in words
+        mirrored = look.mirrored.left < (_BETTER if plain else 1.0 / _BETTER) * left
     guess = ""
     if mirrored:
         guess = (
@@ -119,14 +132,15 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
             )
     further = look.centred > _FURTHER * look.motion and not (moved and not guess)
     name = samples.log.name
-    refusal = ""
+    refusal = late
     if further:
         questions.append(further_than_still(samples, robot, look.scale, guess))
     elif guess:
         questions.append(
             f"log {name!r} fits robot {robot.name!r} badly. {guess}" + ("" if mirrored else f" {_RIGHT}")
         )
-    if mirrored or (guess and further and "times" not in words):
+    many = mixed_up and as_it_is > _MANY * left
+    if mirrored or (guess and "times" not in words and (further or many)):
         refusal = questions[-1]
     return Reading(
         registration=frame if moved and not guess else None,
@@ -134,6 +148,12 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
         refusal=refusal,
         guess=guess,
     )
+
+
+def left_by(samples: LogSamples, robot: Robot, threads: int | None = None) -> float:
+    """Distance that the model as the robot file has it leaves of some rows of `samples`, root mean square
+    without the farthest, seen by a camera that stands where it fits best [m]."""
+    return _Look(samples, robot, threads).frame.left
 
 
 def further_than_still(samples: LogSamples, robot: Robot, scale: float, guess: str = "") -> str:
@@ -164,7 +184,7 @@ def time_question(samples: LogSamples) -> str:
     name, last = samples.log.name, float(samples.time.max())
     return (
         f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes "
-        "seconds."
+        'seconds, or [log] units = {time = "ms"} in the robot file, and "s" where it is so slow.'
     )
 
 
@@ -252,14 +272,9 @@ def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[t
     n = dl.shape[1]
     if not n or not np.ptp(dl, axis=0).any():
         return
-    yield -dl, "the sign of every dl_ reversed"
-    groups = [np.flatnonzero(np.asarray(robot.tendon_segment) == k) for k in range(robot.n_segments)]
-    orders: dict[tuple[int, ...], str] = {}
-    for order, words in _orders(n, groups):
-        orders.setdefault(tuple(order), words)
-    for columns, words in orders.items():
-        if columns != tuple(range(n)):
-            yield dl[:, list(columns)], words
+    yield -dl, _words(np.arange(n), -np.ones(n))
+    if (found := column_order(samples, robot)) is not None:
+        yield found.of(dl), _words(found.order, found.sign)
     for factor, words in _SCALES.items():
         # a rod that bends far moves less than in proportion: not the very factor
         fewer = not np.isfinite(scale) or scale < 1.0
@@ -267,23 +282,17 @@ def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[t
             yield factor * dl, f"every dl_ times {factor:.4g} ({words})"
 
 
-def _orders(n: int, groups: list[Ints]) -> Iterator[tuple[list[int], str]]:
-    """Orders of the dl_ columns that people mix up, and how in words."""
-    for i in range(n - 1):
-        order = list(range(n))
-        order[i], order[i + 1] = i + 1, i
-        yield order, f"dl_{i + 1} and dl_{i + 2} exchanged"
-    for group in groups:
-        if len(group) == 4:  # antagonists
-            for i, j in ((group[0], group[2]), (group[1], group[3])):
-                order = list(range(n))
-                order[i], order[j] = int(j), int(i)
-                yield order, f"dl_{i + 1} and dl_{j + 1} exchanged"
-    sizes = [len(group) for group in groups if len(group)]
-    for step in range(1, max(sizes, default=1)):
-        order = [int(group[(k + step) % len(group)]) for group in groups for k in range(len(group))]
-        yield order, f"the dl_ columns of each segment moved on by {step}"
-    yield [int(i) for group in groups for i in group[::-1]], "the dl_ columns of each segment in reverse"
-    yield list(range(n))[::-1], "the dl_ columns in reverse"
-    if len(sizes) > 1 and len(set(sizes)) == 1:
-        yield [int(i) for group in groups[::-1] for i in group], "the segments in reverse"
+def _words(order: Ints, sign: Floats) -> str:
+    """An order of the columns and their signs, as a user would say them."""
+    moved = np.flatnonzero(order != np.arange(len(order))) + 1
+    said = []
+    if len(moved) == 2:
+        said.append(f"dl_{moved[0]} and dl_{moved[1]} exchanged")
+    elif len(moved):
+        said.append(f"the dl_ columns in the order {', '.join(map(str, order + 1))}")
+    reversed_ = np.sort(order[sign < 0.0]) + 1
+    if len(reversed_) == len(order):
+        said.append("the sign of every dl_ reversed")
+    elif len(reversed_):
+        said.append(f"the sign of {', '.join(f'dl_{k}' for k in reversed_)} reversed")
+    return " and ".join(said)

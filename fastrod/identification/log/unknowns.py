@@ -203,7 +203,6 @@ class Model:
             tables.append(table)
         return replace(self.robot_at(theta), effects=tuple(tables), fit={}, sensor={})
 
-
     def in_sessions(self, theta: Floats) -> tuple[Robot, ...]:
         """The robot as `identified` in each session; once, where none has anything of its own."""
         count = len(self.sessions) if any(u.session for u in self.unknowns) else 1

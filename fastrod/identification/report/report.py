@@ -75,6 +75,7 @@ def to_json(result: Result) -> dict[str, Any]:
         ],
         "base_parameters": _estimates(result.base_parameters),
         "registration": _registration(result.registration),
+        "clock": None if result.clock is None else _estimates({"offset": result.clock})["offset"],
         "correlation": {"names": list(names), "matrix": matrix},
         "remaining": {
             "structured_fraction": result.remaining_fraction,

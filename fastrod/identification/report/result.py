@@ -136,6 +136,8 @@ class Result:
     registration: CameraRegistration | None = None
     """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
     search."""
+    clock: Estimate | None = None
+    """Time by which commands stand later in the log than they acted [s]; None where both have one clock."""
     sessions: Mapping[str, Robot] = field(default_factory=dict)
     """The identified robot in each other session, by its label."""
     as_given_rms: tuple[float, float] | None = None

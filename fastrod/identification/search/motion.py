@@ -80,9 +80,7 @@ class MotionRod:
         return [self._known[repr(each)] for each in robots]
 
 
-def _batches(
-    robots: dict[str, tuple[Robot, ...]],
-) -> Iterator[tuple[list[str], list[tuple[Robot, ...]]]]:
+def _batches(robots: dict[str, tuple[Robot, ...]]) -> Iterator[tuple[list[str], list[tuple[Robot, ...]]]]:
     """Robots that may move side by side: with the same effects, neutral where one has none, and the same
     geometry, which effects need; those whose effects go by what the rod does, which takes longer, apart."""
     some = any(every[0].effects for every in robots.values())

@@ -1,0 +1,83 @@
+"""Offset between the clock of the commands and that of the camera, before anything is fitted.
+
+A drive or a camera that is late is an effect (`latency`). Commands that come after what they cause are no
+effect of any robot: two clocks are off.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
+from fastrod.identification.log.registration import align
+from fastrod.identification.log.unknowns import known_model
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
+
+MARGIN = 0.2
+"""Delay [s] that is left for the fit to find once commands are laid on the camera's clock, so that it may
+come out smaller as well as larger: 0.54 mm of play made a first look 0.1 s wrong."""
+LONGEST = 1.0
+"""Offset that is looked for [s]."""
+_STEPS = 101  # of the offsets on each side
+_STRETCHES, _ROWS = 6, 250  # of consecutive samples that are solved
+_LEAST = 30  # of them compared
+_BETTER = 0.8  # of what is left without it: less is the offset's merit
+
+
+def clock_offset(samples: LogSamples, robot: Robot, threads: int | None = None) -> float:
+    """Time by which commands stand later in the log than they acted [s]; 0 where they do not, or where the
+    log does not show it."""
+    stretches = _stretches(samples)
+    if not stretches:
+        return 0.0
+    rows = np.concatenate(stretches)
+    model, some = known_model(robot), samples.on(rows)
+    pose = predict(model, model.start, some, PredictedRod(some, robot, threads=threads))
+    time, made = samples.time[rows], np.where(pose.ok[:, None], pose.position, np.nan)
+    tip = np.asarray(samples.log.tip_position)[rows]
+    each = np.cumsum([0, *map(len, stretches)])
+
+    def left(offset: float) -> float:
+        """Distance that is left with the prediction from that much later rows [m]."""
+        later = np.full_like(made, np.nan)
+        for a, b in pairwise(each):
+            inside = (time[a:b] + LONGEST <= time[b - 1]) & (time[a:b] - LONGEST >= time[a])
+            for axis in range(3):
+                at = np.interp(time[a:b] + offset, time[a:b], made[a:b, axis])
+                later[a:b, axis] = np.where(inside, at, np.nan)
+        known = np.isfinite(later).all(1) & np.isfinite(tip).all(1)
+        return align(tip[known], later[known]).left if known.sum() >= _LEAST else np.inf
+
+    offsets = np.linspace(-LONGEST, LONGEST, 2 * _STEPS - 1)
+    size = np.array([left(offset) for offset in offsets])
+    best = int(np.argmin(size))
+    step = float(np.median(np.diff(time)))
+    if offsets[best] <= max(step, 2.0 * offsets[1] - 2.0 * offsets[0]) or size[best] > _BETTER * left(0.0):
+        return 0.0
+    return float(offsets[best])
+
+
+def clock_sentence(log: RunLog, offset: float) -> str:
+    """Say to a user what was found."""
+    return (
+        f"the commands of log {log.name!r} stand {offset:.2f} s later than the motion that they cause: "
+        "commands and camera have two clocks"
+    )
+
+
+def _stretches(samples: LogSamples) -> list[np.ndarray]:
+    """Rows of consecutive samples, evenly over the runs that are long enough and dense enough to tell an
+    offset."""
+    found: list[np.ndarray] = []
+    for span in samples.runs:
+        count = min(_ROWS, span.stop - span.start)
+        for first in np.linspace(span.start, span.stop - count, _STRETCHES).astype(int):
+            rows = np.arange(first, first + count)
+            lasts = samples.time[rows[-1]] - samples.time[rows[0]]
+            if lasts > 3.0 * LONGEST and lasts < LONGEST * count / 4.0:
+                found.append(rows)
+    every = max(1, len(found) // _STRETCHES)
+    return found[::every][:_STRETCHES]
