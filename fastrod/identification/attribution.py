@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
 from fastrod.identification.log.base_model import base_model
@@ -148,7 +149,7 @@ def identify(
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
     if clock:
-        result = _on_one_clock(result, clock)
+        result = _on_one_clock(result, robot, clock)
     return (
         replace(result, network=residual_network(log.samples, base.start.model.wiring, result))
         if network
@@ -156,24 +157,29 @@ def identify(
     )
 
 
-def _on_one_clock(result: Result, laid: float) -> Result:
-    """The result of a log whose commands were laid on the camera's clock `laid` + `MARGIN` [s] earlier: the
-    delay that is fitted is what is left of that."""
+def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:
+    """The result of a log of `robot` whose commands were laid on the camera's clock `laid` + `MARGIN` [s]
+    earlier: what is left of that is the delay that was fitted, which is no delay of the robot."""
+    own = named_effects(robot).get("latency")
     delay = result.base_parameters["latency.delay"]
-    offset = replace(delay, value=laid + MARGIN - delay.value)
+    known = 0.0 if own is None else float(own["delay"])
+    offset = replace(delay, value=laid + MARGIN + known - delay.value)
     sentence = (
         f"The commands stand {with_error(offset.value, offset.stderr, 's')} later in the log than they "
         "acted: two clocks; all errors are given with both on one."
     )
 
-    def clocked(robot: Robot) -> Robot:
-        return replace(robot, log=replace(robot.log, clock=robot.log.clock + laid + MARGIN))
+    def clocked(found: Robot) -> Robot:
+        others = tuple(effect for effect in found.effects if effect["name"] != "latency")
+        late = () if own is None else ({"name": "latency", **own},)
+        clock = robot.log.clock + offset.value
+        return replace(found, log=replace(robot.log, clock=clock), effects=(*late, *others))
 
     return replace(
         result,
         clock=offset,
         identified=clocked(result.identified),
-        sessions={label: clocked(robot) for label, robot in result.sessions.items()},
+        sessions={label: clocked(each) for label, each in result.sessions.items()},
         summary=f"{result.summary} {sentence}",
     )
 

@@ -203,7 +203,7 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
 
 def on_one_clock(log: RunLog, clock: float) -> RunLog:
     """The log with its commands laid on the clock of what was measured: those of time t stand in the row of
-    t + `clock` [s]."""
+    t + `clock` [s]. Rows for which no command is known miss it."""
     if not clock:
         return log
     names = [name for name in ("dl", "pos", "ext") if getattr(log, name) is not None]
@@ -214,7 +214,9 @@ def on_one_clock(log: RunLog, clock: float) -> RunLog:
             for column in values.T:
                 rows = own & np.isfinite(column)
                 if rows.any():
-                    column[own] = np.interp(log.t[own] + clock, log.t[rows], column[rows])
+                    column[own] = np.interp(
+                        log.t[own] + clock, log.t[rows], column[rows], left=np.nan, right=np.nan
+                    )
     return replace(log, **made)
 
 

@@ -21,7 +21,7 @@ MARGIN = 0.2
 come out smaller as well as larger: 0.54 mm of play made a first look 0.1 s wrong."""
 LONGEST = 1.0
 """Offset that is looked for [s]."""
-_STEPS = 101  # of the offsets on each side
+_STEPS = 10  # of the offsets on each side, and of each of these steps
 _STRETCHES, _ROWS = 6, 250  # of consecutive samples that are solved
 _LEAST = 30  # of them compared
 _BETTER = 0.8  # of what is left without it: less is the offset's merit
@@ -51,13 +51,11 @@ def clock_offset(samples: LogSamples, robot: Robot, threads: int | None = None) 
         known = np.isfinite(later).all(1) & np.isfinite(tip).all(1)
         return align(tip[known], later[known]).left if known.sum() >= _LEAST else np.inf
 
-    offsets = np.linspace(-LONGEST, LONGEST, 2 * _STEPS - 1)
-    size = np.array([left(offset) for offset in offsets])
-    best = int(np.argmin(size))
+    rough = min(np.linspace(-LONGEST, LONGEST, 2 * _STEPS + 1), key=left)
+    best = float(min(rough + np.linspace(-1.0, 1.0, 2 * _STEPS + 1) * LONGEST / _STEPS, key=left))
     step = float(np.median(np.diff(time)))
-    if offsets[best] <= max(step, 2.0 * offsets[1] - 2.0 * offsets[0]) or size[best] > _BETTER * left(0.0):
-        return 0.0
-    return float(offsets[best])
+    known = best > max(step, 2.0 * LONGEST / _STEPS**2) and left(best) < _BETTER * left(0.0)
+    return best if known else 0.0
 
 
 def clock_sentence(log: RunLog, offset: float) -> str:

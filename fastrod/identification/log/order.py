@@ -44,14 +44,15 @@ class ColumnOrder:
 
 def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> ColumnOrder | None:
     """The columns of a log matched to the tendons, which stand where the robot file says; None where the log
-    says nothing. With a `sign` of all columns, 1 or -1, the tendons of each segment may be rotated together
-    about its axis: of a robot whose segments stand at unknown angles, seen by a camera that does."""
+    moves them in too few ways. With a `sign` of all columns, 1 or -1, the tendons of each segment may be
+    rotated together about its axis: of a robot whose segments stand at unknown angles, seen by a camera that
+    does."""
     log, rows = samples.log, samples.rows
     dl, tip = np.asarray(log.dl)[rows], np.asarray(log.tip_position)[rows]
     if dl.shape[1] != robot.n_tendons or robot.n_tendons < 2 or len(rows) < 3 * robot.n_tendons:
         return None
     measured, model = -_answer(dl, tip), -_answers(robot)
-    if not measured.any():
+    if np.linalg.matrix_rank(dl - dl.mean(axis=0), rtol=_SEEN) < np.linalg.matrix_rank(model, rtol=_SEEN):
         return None
     segment = np.asarray(robot.tendon_segment)
     if not sign:

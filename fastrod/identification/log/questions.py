@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats, Ints
 
 _ROWS = 300  # rows that are looked at
+_FEW = 6  # tendons, of which any two may be exchanged; of more, neighbours
 _LEAST = 12  # of them solved; fewer say nothing
 _FOLLOWS = 0.45  # of the motion: a reading that leaves less follows it; 0.55 mm of backlash left 0.18
 # of it: less is an effect's matter; two tendons of different segments exchanged left 0.42
@@ -275,6 +277,11 @@ def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[t
     yield -dl, _words(np.arange(n), -np.ones(n))
     if (found := column_order(samples, robot)) is not None:
         yield found.of(dl), _words(found.order, found.sign)
+    for i, j in combinations(range(n), 2):
+        if n <= _FEW or j == i + 1:
+            order = np.arange(n)
+            order[[i, j]] = j, i
+            yield dl[:, order], _words(order, np.ones(n))
     for factor, words in _SCALES.items():
         # a rod that bends far moves less than in proportion: not the very factor
         fewer = not np.isfinite(scale) or scale < 1.0
