@@ -10,13 +10,20 @@ from fastrod.moved import refuse_old_names
 
 if TYPE_CHECKING:
     from fastrod import reference
+    from fastrod.contact.scene import ContactScene
     from fastrod.hosts.rod import Rod
+    from fastrod.identification.attribution import identify
+    from fastrod.identification.log.check import check
+    from fastrod.identification.log.replay import replay
+    from fastrod.logs.runlog import RunLog, read_log, write_log
     from fastrod.simulator import Simulator
     from fastrod.solver.modal import Modes
     from fastrod.solver.state import Observer, Pose, State
     from fastrod.solver.tape import Tips
+    from fastrod_viewer.live import view
 
 __all__ = [
+    "ContactScene",
     "Lump",
     "Modes",
     "Observer",
@@ -24,24 +31,39 @@ __all__ = [
     "Problem",
     "Robot",
     "Rod",
+    "RunLog",
     "Segment",
     "Simulator",
     "State",
     "Tendon",
     "Tips",
+    "check",
+    "identify",
     "load_robot",
+    "read_log",
     "reference",
+    "replay",
     "robot_names",
     "save_robot",
+    "view",
+    "write_log",
 ]
 _HOME = {
-    "Modes": "solver.modal",
-    "Observer": "solver.state",
-    "Pose": "solver.state",
-    "Rod": "hosts.rod",
-    "Simulator": "simulator",
-    "State": "solver.state",
-    "Tips": "solver.tape",
+    "ContactScene": "fastrod.contact.scene",
+    "Modes": "fastrod.solver.modal",
+    "Observer": "fastrod.solver.state",
+    "Pose": "fastrod.solver.state",
+    "Rod": "fastrod.hosts.rod",
+    "RunLog": "fastrod.logs.runlog",
+    "Simulator": "fastrod.simulator",
+    "State": "fastrod.solver.state",
+    "Tips": "fastrod.solver.tape",
+    "check": "fastrod.identification.log.check",
+    "identify": "fastrod.identification.attribution",
+    "read_log": "fastrod.logs.runlog",
+    "replay": "fastrod.identification.log.replay",
+    "view": "fastrod_viewer.live",
+    "write_log": "fastrod.logs.runlog",
 }
 
 refuse_old_names()
@@ -55,7 +77,7 @@ def __getattr__(name: str) -> Any:
     if name == "reference":
         return importlib.import_module("fastrod.reference")
     if name in _HOME:
-        return getattr(importlib.import_module(f"fastrod.{_HOME[name]}"), name)
+        return getattr(importlib.import_module(_HOME[name]), name)
     from fastrod.errors import nearest
 
     raise AttributeError(f"module 'fastrod' has no {name!r}; {nearest(name, __all__)}")

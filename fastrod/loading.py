@@ -23,6 +23,11 @@ def load_robot(source: str | Path) -> Robot:
     return robot
 
 
+def robot_of(given: Robot | str | Path) -> Robot:
+    """A robot, or the one of a shipped name or of a path to a .toml. Raises what `load_robot` does."""
+    return given if isinstance(given, Robot) else load_robot(given)
+
+
 def with_line_density(robot: Robot, density: float | None) -> Robot:
     """The robot with this mass per length [kg/m] in all its segments, or as it is for None; lumps stay.
 

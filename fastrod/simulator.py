@@ -54,6 +54,7 @@ class Simulator(Motions):
     """
 
     @options.renamed_options(hold_gain="kept_jacobian_tolerance")
+    @named_inputs
     def __init__(
         self,
         robot: Robot | Sequence[Robot],
@@ -241,7 +242,7 @@ class Simulator(Motions):
         rows: ArrayLike | None = None,
     ) -> State:
         """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as
-        for `step`.
+        for `step`. Without lengths or tensions the tendons are as at rest.
 
         Where Newton's method would diverge, the loads grow from none to all (load continuation). Robots that
         still do not
@@ -253,6 +254,8 @@ class Simulator(Motions):
         inputs are not read. Not with a contact scene.
         """
         check_positive("tolerance", tolerance, "m")
+        if tendon_length is None and tension is None:
+            tendon_length, tension = self._at_rest()
         given = Inputs(
             tendon_length,
             tension,
@@ -280,6 +283,16 @@ class Simulator(Motions):
         self._move_obstacles(moved)
         state = self._settle(ports, read, tolerance, only)
         return self._balanced(given, state, tolerance, only) if self._chain.follows else state
+
+    def _at_rest(self) -> tuple[Floats | None, Floats | None]:
+        """Lengths of tendons at rest (n_robots or 1, n_tendons) [m], or no tension, as the robots are driven;
+        None of what does not drive them, and where it is mixed."""
+        modes = {segment.mode for robot in self.robots for segment in robot.segments} - {"passive"}
+        if modes == {"tendon_tension"}:
+            return None, np.zeros((1, self.robots[0].n_tendons))
+        if modes and "tendon_tension" not in modes:
+            return np.stack([robot.rest_tendon_length for robot in self.robots]), None
+        return None, None
 
     def _refuse_follower_line(self, force: ArrayLike | None) -> None:
         if force is not None and self.solver != "modal":

@@ -263,7 +263,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         "env",
         nargs="?",
         metavar="ENV",
-        help="a task, such as Reach or fastrod/Reach-v0; with --resume the folder knows",
+        help="a task, such as Reach, or FILE.py:Class of your own; with --resume the folder knows",
     )
     train.add_argument("--algo", metavar="A", help="sac, ppo or td3 (default: the task's preset)")
     train.add_argument(
@@ -310,7 +310,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     evaluate = commands.add_parser(
         "evaluate", help="a policy beside the baselines: success, distance, contacts"
     )
-    evaluate.add_argument("env", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0")
+    evaluate.add_argument("env", metavar="ENV", help="a task, such as Reach, or FILE.py:Class of your own")
     evaluate.add_argument(
         "policy",
         metavar="POLICY",

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 BASE_FIT = "base fit: "
 """How the sentence begins that `identify` says once its base model is fitted."""
+_SMALL = 0.3  # of the steps of a preset: fewer are worth a word
 _PATIENCE = 10.0  # s without a line
 
 
@@ -252,9 +253,12 @@ def _envs(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace) -> int:
     _need("stable_baselines3", "train", "rl")
+    from fastrod_envs.registration import name_of
     from fastrod_envs.training import make_plan, read_config, resume, train
 
     out: Path | None = arguments.out
+    if arguments.env is not None:
+        name_of(arguments.env)  # of a file of one's own, which is run now
     if arguments.resume:
         if out is None:
             raise InputError("--resume needs --out DIR, the folder of the training to resume.")
@@ -277,10 +281,14 @@ def _train(arguments: argparse.Namespace) -> int:
             settings=_pairs(arguments.set, "--set"),
             curriculum=arguments.curriculum,
         )
+        usual = make_plan(arguments.env).steps
+        if plan.steps < _SMALL * usual:
+            few = f"{plan.steps:,} steps are {100.0 * plan.steps / usual:.2g} % of the {usual:,}"
+            print(f"{few} that the preset takes: expect little success.", file=sys.stderr)
         out = out or Path(f"{plan.env.partition('/')[2]}_{plan.algorithm}_{plan.seed}")
         with _progress() as bar:
             path = train(plan, out, bar)
-    print(f"wrote {path}; see it with: fastrod evaluate {plan.env} {out}")
+    print(f"wrote {path}; see it with: fastrod evaluate {arguments.env or plan.env} {out}")
     return DONE
 
 
@@ -290,8 +298,10 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     from fastrod_envs import evaluation
     from fastrod_envs.policies import Policy, find
+    from fastrod_envs.registration import name_of
 
     options = _pairs(arguments.option, "--option")
+    name_of(arguments.env)  # of a file of one's own, which is run now
     policy = (
         None
         if arguments.policy == "none"

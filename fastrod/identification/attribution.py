@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, LogError
@@ -31,7 +32,8 @@ from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
 from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
-from fastrod.logs.runlog import RunLog, on_one_clock
+from fastrod.loading import robot_of
+from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.solver.motion import solver_of
 from fastrod.threads import one_blas_thread
@@ -58,8 +60,8 @@ _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 @one_blas_thread
 def identify(
-    logs: RunLog | Sequence[RunLog],
-    robot: Robot,
+    logs: RunLog | str | Path | Sequence[RunLog | str | Path],
+    robot: Robot | str | Path,
     *,
     held_out: Sequence[str] = (),
     max_effects: int = MAX_EFFECTS,
@@ -73,8 +75,9 @@ def identify(
 ) -> Result:
     """Find what the model of `robot` lacks to explain `logs`, and say how much it brings on data held out.
 
-    `held_out`: labels of runs, or `RUN@START:END` [s], that no fit sees; where none is given, every fourth
-    stretch of each run. `max_effects` at most are named. `exclude` takes effects out of the library.
+    Logs and robot may be given by their files, and a shipped robot by its name. `held_out`: labels of runs,
+    or `RUN@START:END` [s], that no fit sees; where none is given, every fourth stretch of each run.
+    `max_effects` at most are named. `exclude` takes effects out of the library.
     With `max_effects` 0 nothing is looked for: the base model is fitted, and that is the result.
     `free_camera` leaves registration, marker offset and latency to the fit. `network` trains a small network
     on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
@@ -96,7 +99,9 @@ def identify(
     if network:
         check_network()
     progressed, most = progress or (lambda *_: None), max_effects + _SPARE + 2
-    every = [logs] if isinstance(logs, RunLog) else list(logs)
+    robot = robot_of(robot)
+    given = [logs] if isinstance(logs, (RunLog, str, Path)) or not isinstance(logs, Sequence) else logs
+    every = [log_of(one, robot) for one in given]
     log = split(every, robot, held_out)
     # refuses a wrong [fit] before anything is solved
     model = base_model(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import LogError, UnknownNameError, nearest
+from fastrod.errors import LogError, UnknownNameError, nearest, shown
 from fastrod.logs.columns import translated
 from fastrod.logs.table import Table, arrow, numbers, read_table
 from fastrod.model.robot import Robot
@@ -147,7 +147,7 @@ class RunLog:
         return self.rows(np.isin(self.run, runs))
 
 
-def read_log(path: str | Path, robot: Robot) -> RunLog:
+def read_log(path: str | Path, robot: Robot | str | Path) -> RunLog:
     """The run log at `path` (.csv, .parquet or .mat) for `robot`, checked against it.
 
     A file with columns of its own is translated as `[log]` of the robot file says.
@@ -157,6 +157,7 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
     the robot.
     """
     path = Path(path)
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
     where = path.name
     table = translated(read_table(path), robot.log, where)
     n = len(next(iter(table.values())))
@@ -199,6 +200,16 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
     log = on_one_clock(log, robot.log.clock)
     _check_units(log, robot, where)
     return log
+
+
+def log_of(given: RunLog | str | Path, robot: Robot) -> RunLog:
+    """A run log, or the one of a file of `robot`. Raises what `read_log` does, `LogError` for what is
+    neither."""
+    if isinstance(given, RunLog):
+        return given
+    if not isinstance(given, (str, Path)):
+        raise LogError(f"the log is {shown(given)}; give a RunLog, or the path of a file.")
+    return read_log(given, robot)
 
 
 def on_one_clock(log: RunLog, clock: float) -> RunLog:

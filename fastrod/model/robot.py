@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, get_args
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import RobotError, nearest
+from fastrod.errors import RobotError, nearest, shown
 from fastrod.model.logformat import LogFormat
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
@@ -21,11 +22,32 @@ MODES: tuple[str, ...] = get_args(Mode)
 _LONGEST = 10.0  # m; a longer segment was given in mm
 
 
+_Class = TypeVar("_Class")
 _SHORTEST = 1e-6  # m
 _STIFF = (1e-20, 1e15)  # N m^2
 _GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
 _MOST = 1e9
+
+
+def _named_fields(cls: type[_Class]) -> type[_Class]:
+    """The same dataclass; a field that it lacks, or that is missing, raises `RobotError` with the nearest
+    name."""
+    made, known = cls.__init__, [f.name for f in fields(cls)]  # type: ignore[arg-type]
+    needed = [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
+
+    @functools.wraps(made)
+    def checked(self: _Class, *args: Any, **given: Any) -> None:
+        for name in given:
+            if name not in known:
+                raise RobotError(f"{cls.__name__} has no field {name!r}; {nearest(name, known)}")
+        if missing := [name for name in needed if name not in given]:
+            raise RobotError(f"{cls.__name__} lacks {', '.join(missing)}.")
+        made(self, *args, **given)
+
+    # mypy takes no assignment to a method
+    setattr(cls, "__init__", checked)  # noqa: B010
+    return cls
 
 
 def _number(value: object) -> bool:
@@ -59,6 +81,7 @@ def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -
     return value
 
 
+@_named_fields
 @dataclass(frozen=True, kw_only=True)
 class Tendon:
     """A tendon along the backbone, fixed at the end of its segment (the paper's pull wire).
@@ -112,6 +135,7 @@ class Tendon:
         return tuple((d * math.cos(b), d * math.sin(b)) for d, b in zip(offset, angle, strict=True))
 
 
+@_named_fields
 @dataclass(frozen=True, kw_only=True)
 class Lump:
     """A rigid mass on the backbone: a disk, a marker, a payload."""
@@ -141,6 +165,7 @@ class Lump:
             )
 
 
+@_named_fields
 @dataclass(frozen=True, kw_only=True)
 class Segment:
     """A length of backbone with one stiffness, and the tendons that end at its end."""
@@ -169,6 +194,47 @@ class Segment:
     lumps: tuple[Lump, ...] = ()
     mode: Mode = "tendon_length"
     tendons: tuple[Tendon, ...] = ()
+
+    @classmethod
+    def from_material(
+        cls,
+        *,
+        length: float,
+        radius: float,
+        youngs_modulus: float,
+        density: float = 0.0,
+        poisson: float = 0.3,
+        **more: Any,
+    ) -> Segment:
+        """Round segment of one material: stiffness, mass and body from its radius [m], Young's modulus [Pa],
+        density [kg/m^3] and Poisson's ratio.
+
+        It stretches and shears (shear coefficient of a circle by Cowper 1966); `more` are other fields, such
+        as tendons. Raises `RobotError` for numbers that no material has.
+
+        >>> Segment.from_material(length=0.1, radius=1e-3, youngs_modulus=60e9, mode="passive").line_density
+        0.0
+        """
+        for name, value, unit in (("radius", radius, "m"), ("youngs_modulus", youngs_modulus, "Pa")):
+            if not _number(value):
+                raise RobotError(f"{name} is {value!r}; it must be a number [{unit}].")
+            _positive(name, value, unit)
+        if not _number(density) or not 0.0 <= density <= _MOST:
+            raise RobotError(f"density is {density!r} kg/m^3; it must be zero or positive.")
+        if not _number(poisson) or not -1.0 < poisson <= 0.5:
+            raise RobotError(f"poisson is {poisson!r}; Poisson's ratio is above -1, and 0.5 at most.")
+        area, second_moment = math.pi * radius**2, 0.25 * math.pi * radius**4
+        shear_modulus = 0.5 * youngs_modulus / (1.0 + poisson)
+        given: dict[str, Any] = {
+            "length": length,
+            "bending_stiffness": (youngs_modulus * second_moment,) * 2,
+            "torsional_stiffness": 2.0 * shear_modulus * second_moment,
+            "axial_stiffness": youngs_modulus * area,
+            "shear_stiffness": shear_modulus * area * 6.0 * (1.0 + poisson) / (7.0 + 6.0 * poisson),
+            "line_density": density * area,
+            "body_radius": max([radius, *(float(np.max(t.offset)) for t in more.get("tendons", ()))]),
+        }
+        return cls(**(given | more))
 
     def __post_init__(self) -> None:
         _positive("Segment.length", self.length, "m")
@@ -229,6 +295,7 @@ class Segment:
             )
 
 
+@_named_fields
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """A chain of segments on a base, and the world it stands in.
@@ -263,6 +330,10 @@ class Robot:
     """Priors of the measurement (contracts: `[sensor]`)."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.segments, list):
+            object.__setattr__(self, "segments", tuple(self.segments))
+        if not isinstance(self.segments, tuple) or not all(isinstance(s, Segment) for s in self.segments):
+            raise RobotError(f"Robot.segments is {shown(self.segments)}; give a tuple of Segment(...).")
         if not self.segments:
             raise RobotError(f"Robot {self.name!r} has no segments; give at least one.")
         _finite("Robot.base_position", self.base_position, 3, "m")

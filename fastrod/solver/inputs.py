@@ -27,15 +27,23 @@ _MOST = 1e12  # of any unit; products of a few such numbers still are floats
 
 def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """The same method; a keyword that it lacks raises `InputError` with the nearest name."""
-    known = {name for name in inspect.signature(function).parameters if name != "self"}
+    parameters = inspect.signature(function).parameters
+    known = {name for name in parameters if name != "self"}
+    positional = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters.values()) - 1
 
     @functools.wraps(function)
     def checked(*args: _P.args, **inputs: _P.kwargs) -> _R:
+        called = function.__name__ if function.__name__ != "__init__" else type(args[0]).__name__
         for name in inputs:
             if name not in known:
                 once = "the time step is given once: Simulator(robot, dt=...)."
                 why = once if name == "dt" else nearest(name, known)
-                raise InputError(f"{function.__name__} has no input {name!r}; {why}")
+                raise InputError(f"{called} has no input {name!r}; {why}")
+        if len(args) - 1 > positional:
+            raise InputError(
+                f"{called} takes {positional} of its inputs without a name and was given {len(args) - 1}; "
+                "name the others, as in tip_force=..."
+            )
         return function(*args, **inputs)
 
     return checked

@@ -93,6 +93,8 @@ def check_solver(
 ) -> Literal["observer", "modal"]:
     """The solver of these robots. Raises `InputError` for one that there is not or that cannot do what is
     asked, and for options that it does not read."""
+    if not isinstance(dynamics, bool):
+        raise InputError(f"dynamics is {dynamics!r}; it must be True or False.")
     found = solver_of(robots, solver, dynamics)
     scheme_of(scheme, rho)
     if modes is not None:

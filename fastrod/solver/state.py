@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from fastrod.errors import InputError, Problem, ProblemSentence, shown
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, RodShape
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +112,17 @@ class State:
     def as_shape(self) -> RodShape:
         """The arrays that a pass writes."""
         return RodShape(*(getattr(self, name) for name in RodShape._fields))
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the rods on 3D axes of matplotlib, in mm; on new ones where none are given."""
+        from fastrod.solver.picture import plot_rods
+
+        return plot_rods(self.position, axes)
+
+    def _repr_html_(self) -> str:
+        from fastrod.solver.picture import html_of
+
+        return html_of(self.tip_position, self.tension, self.ok, self.problems)
 
     def __repr__(self) -> str:
         n = len(self.ok)

@@ -5,20 +5,25 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import time
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from fastrod_envs.registration import make_task, name_of, names, task_class
 from fastrod_envs.task import Field
 
+_TIMED, _DRAWN = 0.3, 10  # s; actions
+
 
 def summary() -> str:
-    """A line for each task."""
+    """A line for each task; tasks on a rigid host step one after the other, however many there are."""
     lines = []
     for name in names():
         kind = task_class(name)
         first = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("\n", " ")
-        lines.append(f"fastrod/{name}-v0  {first}{' (PyBullet)' if kind.hosted else ''}")
+        lines.append(f"fastrod/{name}-v0  {first}{' (on PyBullet)' if kind.hosted else ''}")
     return "\n".join(lines)
 
 
@@ -37,10 +42,32 @@ def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
             "Observation\n" + _fields(seen),
             "Action, each number from -1 to 1, which mean\n" + _fields(task.actions),
             "Options\n" + _options(kind.options_class),
+            _speed(name, kind.hosted, options or {}),
         ]
     finally:
         task.close()
     return "\n\n".join(entries)
+
+
+def _speed(name: str, hosted: bool, options: Mapping[str, Any]) -> str:
+    """How fast the task steps on this machine, alone and side by side."""
+    from fastrod_envs.vector import BatchEnv
+
+    said = []
+    for n in (1, 16 if hosted else 256):
+        batch = BatchEnv(name, n, **options)
+        batch.reset(seed=0)
+        rng = np.random.default_rng(0)
+        drawn = [rng.uniform(-1.0, 1.0, (n, batch.task.n_actions)) for _ in range(_DRAWN)]
+        batch.step(drawn[0])  # what is compiled by then is not counted
+        begun, steps = time.perf_counter(), 0
+        while time.perf_counter() - begun < _TIMED:
+            batch.step(drawn[steps // n % _DRAWN])
+            steps += n
+        said.append(f"{steps / (time.perf_counter() - begun):,.0f} with {n}")
+        batch.close()
+    why = "on PyBullet, one robot after the other" if hosted else "all robots in one batch"
+    return f"Speed\n  steps a second here, {why}: {', '.join(said)}"
 
 
 def _fields(entries: tuple[Field, ...]) -> str:

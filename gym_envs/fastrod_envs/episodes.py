@@ -77,6 +77,7 @@ class Episodes:
         self.returned: Floats = np.zeros(self.n)
         """(n,) sum of its rewards."""
         self._streams = Streams(self.n, task.total_draws)
+        self._drawn = np.zeros((self.n, task.total_draws))
         entries = task.goals if task.options.observation == "goal" else task.states
         low, high = bounds(entries)
         self.low: Singles = low.astype(np.float32)
@@ -89,15 +90,18 @@ class Episodes:
         """A seed for each environment; None leaves its stream as it is. Raises `InputError`."""
         self._streams.seed(seeds)
 
-    def begin(self, rows: Ints) -> None:
-        """New episodes for these robots."""
-        self.task.begin(rows, self._streams.draw(rows))
+    def begin(self, rows: Ints, *, again: bool = False) -> None:
+        """New episodes for these robots, or `again` those that they began last."""
+        if not again:
+            self._drawn[rows] = self._streams.draw(rows)
+        self.task.begin(rows, self._drawn[rows])
         self.elapsed[rows] = 0
         self.returned[rows] = 0.0
         self._running[rows] = True
 
     def checked(self, actions: ArrayLike) -> Floats:
-        """(n, n_actions) within -1 and 1. Raises `InputError` on a wrong shape and on what is not finite."""
+        """(n, n_actions) clipped to -1 and 1. Raises `InputError` on a wrong shape and on what is not
+        finite."""
         refuse_masked("action", actions)
         try:
             a = np.asarray(actions, dtype=np.float64)
@@ -115,9 +119,12 @@ class Episodes:
             raise InputError(f"the action of environment {i} is not finite: {a[i]}; nothing was simulated.")
         return np.clip(a, -1.0, 1.0)
 
-    def advance(self, actions: ArrayLike) -> Moment:
-        """One step of all. Raises `InputError` as `checked`, and where an episode has not begun."""
+    def advance(self, actions: ArrayLike, waiting: Flags | None = None) -> Moment:
+        """One step of all, which counts for those that are not `waiting` (n,). Raises `InputError` as
+        `checked`, and where an episode has not begun."""
         checked = self.checked(actions)
+        counts = np.ones(self.n, bool) if waiting is None else ~waiting
+        checked[~counts] = 0.0
         if not self._running.all():
             raise InputError(
                 f"environment {int(np.flatnonzero(~self._running)[0])} has no episode under "
@@ -128,9 +135,10 @@ class Episodes:
         reward = np.zeros(self.n)
         for term in outcome.terms.values():
             reward += term
-        self.elapsed += 1
+        reward[~counts] = 0.0
+        self.elapsed += counts
         self.returned += reward
-        terminated = outcome.terminated | outcome.lost
+        terminated = (outcome.terminated | outcome.lost) & counts
         truncated = (self.elapsed >= self.n_steps) & ~terminated
         self._running &= ~(terminated | truncated)
         return Moment(outcome, reward, terminated, truncated)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
@@ -73,11 +76,37 @@ def id_of(name: str) -> str:
 
 
 def name_of(given: str) -> str:
-    """The task's name from its name or its id. Raises `UnknownNameError` with the nearest."""
+    """The task's name from its name, its id, or `FILE.py:Class` of one's own, whose file is then run. Raises
+    `UnknownNameError` with the nearest."""
+    path, colon, word = str(given).rpartition(":")
+    if colon and path.endswith(".py"):
+        return register(_class_in(Path(path), word)).name
     name = str(given).removeprefix("fastrod_envs:").removeprefix(f"{NAMESPACE}/").removesuffix(f"-{VERSION}")
     if name not in _TASKS:
         raise UnknownNameError(f"no environment {given!r}; {nearest(name, _TASKS)}")
     return name
+
+
+def _class_in(path: Path, word: str) -> type[Task]:
+    """The task of this name in a file of Python. Raises `InputError` for a file that cannot be run,
+    `UnknownNameError` for a task that is not there."""
+    module = f"_fastrod_tasks_{path.stem}"
+    if module not in sys.modules:
+        spec = spec_from_file_location(module, path)
+        if spec is None or spec.loader is None or not path.is_file():
+            raise InputError(f"task file {str(path)!r} cannot be read: No such file or directory.")
+        made = sys.modules[module] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(made)
+        except Exception as error:  # a stranger's file raises what it likes
+            del sys.modules[module]
+            raise InputError(f"task file {str(path)!r} cannot be run: {error!r}.") from error
+    known = {
+        n: c for n, c in vars(sys.modules[module]).items() if isinstance(c, type) and issubclass(c, Task)
+    }
+    if word not in known:
+        raise UnknownNameError(f"no task {word!r} in {str(path)!r}; {nearest(word, known)}")
+    return known[word]
 
 
 def entry_of(name: str) -> TaskEntry:

@@ -9,12 +9,23 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
 from fastrod.errors import InputError
 from fastrod_envs.episodes import Singles
+from fastrod_envs.task import Task
 from fastrod_envs.vector import BatchEnv
+
+
+def make(task: str | type[Task], num_envs: int = 1, **options: Any) -> BatchVecEnv:
+    """Make environments of a task for stable-baselines3; arguments as of `BatchEnv`.
+
+    >>> make("Reach", 2).num_envs
+    2
+    """
+    return BatchVecEnv(BatchEnv(task, num_envs, **options))
 
 
 @final
@@ -28,6 +39,9 @@ class BatchVecEnv(VecEnv):
     """
 
     def __init__(self, env: BatchEnv) -> None:
+        """Raises `InputError` for a batch that begins episodes in the next step."""
+        if env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
+            raise InputError("stable-baselines3 needs a batch with autoreset='same_step'.")
         self.env = env
         self.render_mode = env.render_mode
         self._action: Singles | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Literal, final
 
 import gymnasium
 import numpy as np
@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, nearest
 from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats
 from fastrod_envs.episodes import Episodes, Singles
@@ -19,6 +19,8 @@ from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
 from fastrod_envs.registration import make_task, task_class
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.task import Task
+
+_AUTORESET = {"same_step": AutoresetMode.SAME_STEP, "next_step": AutoresetMode.NEXT_STEP}
 
 
 def action_space(task: Task) -> gymnasium.spaces.Box:
@@ -28,7 +30,9 @@ def action_space(task: Task) -> gymnasium.spaces.Box:
 
 @final
 class BatchEnv(VectorEnv[Singles, Any, Any]):
-    """N environments in one; those that end begin anew in the same step (`AutoresetMode.SAME_STEP`).
+    """N environments in one; those that end begin anew in the same step (`AutoresetMode.SAME_STEP`), or with
+    autoreset="next_step" in the next one, whose action they do not heed, as Gymnasium's vector wrappers want
+    it. Actions beyond -1 and 1 are clipped.
 
     Environment i of `reset(seed=s)` is the environment of `gymnasium.make` after `reset(seed=s + i)`, bit for
     bit, whatever N is.
@@ -57,13 +61,17 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        autoreset: Literal["same_step", "next_step"] = "same_step",
         **options: Any,
     ) -> None:
-        """`task` is the name in the id, or a task's class; `options` are those of the task (`Options`),
-        `max_episode_steps` is another name of n_steps. Raises `InputError`, `UnknownNameError`,
-        `HostError`."""
+        """`task` is the name in the id, `FILE.py:Class`, or a task's class; `options` are those of
+        the task (`Options`), `max_episode_steps` is another name of n_steps. Raises `InputError`,
+        `UnknownNameError`, `HostError`."""
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
+        if autoreset not in _AUTORESET:
+            raise InputError(f"autoreset is {autoreset!r}; {nearest(str(autoreset), _AUTORESET)}")
+        self.metadata = {**self.metadata, "autoreset_mode": _AUTORESET[autoreset]}  # type: ignore[misc]
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
         self.task = make_task(
@@ -78,6 +86,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._every = np.ones(self.num_envs, bool)
+        self._next_step, self._over = autoreset == "next_step", np.zeros(self.num_envs, bool)
 
     @property
     def n_steps(self) -> int:
@@ -117,6 +126,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         )
         self.task.set_difficulty(level)
         self._episodes.begin(np.flatnonzero(mask))
+        self._over &= ~mask
         return self._episodes.observation(), {}
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -141,11 +151,16 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         """One step of all environments: `actions` (n, n_actions); observations (n, size), rewards, terminated
         and truncated (n,), infos.
 
-        Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated.
+        Actions beyond -1 and 1 are clipped. Raises `InputError` on a wrong shape and on what is not finite;
+        then nothing was simulated.
         """
-        moment = self._episodes.advance(actions)
+        begins = self._over
+        moment = self._episodes.advance(actions, begins)
         reported = self._episodes.info(moment)
         infos = _masked(reported, self._every)
+        if begins.any():  # they began when the last step ended, and have waited for this one
+            self._episodes.begin(np.flatnonzero(begins), again=True)
+            self._over = np.zeros(self.num_envs, bool)
         observation = self._episodes.observation()
         done = moment.terminated | moment.truncated
         if done.any():
@@ -161,6 +176,9 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
                 "_final_info": done,
             }
             self._episodes.begin(rows)
+            if self._next_step:
+                self._over = done
+                return observation, moment.reward, moment.terminated, moment.truncated, infos
             begun = self._episodes.observation()
             observation = np.where(done[:, None], begun, observation)
         return observation, moment.reward, moment.terminated, moment.truncated, infos

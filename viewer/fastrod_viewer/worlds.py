@@ -242,10 +242,10 @@ class SceneWorld(SimulatedWorld):
         super().__init__(simulator, contact, np.zeros((simulator.n_robots, 3)))
         self.scene = scene
         self.name, self.about, self.duration = scene.name, scene.about, scene.duration
-        obstacles = contact.obstacles if contact is not None else ()
+        obstacles = () if contact is None else contact.obstacles
         self._rest = {o.name: np.array([*o.position, *o.quaternion]) for o in obstacles}
         self._poses = dict(self._rest)
-        self._bodies = tuple(_body(o, _COLORS[k % len(_COLORS)], self.robot) for k, o in enumerate(obstacles))
+        self._bodies = bodies_of(contact, self.robot)
         self.reset()
 
     def inputs(self, t: float) -> dict[str, Any]:
@@ -275,6 +275,12 @@ class SceneWorld(SimulatedWorld):
     def poses(self) -> Floats:
         """Return the poses (n_obstacles, 7) as last given, or as built."""
         return np.array(list(self._poses.values())).reshape(-1, 7)
+
+
+def bodies_of(contact: ContactScene | None, robot: Robot) -> tuple[Body, ...]:
+    """The obstacles of a contact scene about a robot, to be drawn."""
+    obstacles = () if contact is None else contact.obstacles
+    return tuple(_body(each, _COLORS[k % len(_COLORS)], robot) for k, each in enumerate(obstacles))
 
 
 def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.order import ColumnOrder, column_order
 from fastrod.identification.log.questions import left_by, read
-from fastrod.logs.runlog import RunLog, on_one_clock
+from fastrod.loading import robot_of
+from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Floats
@@ -46,12 +48,14 @@ class LogCheck:
     where the columns fit."""
 
 
-def check(log: RunLog, robot: Robot, *, threads: int | None = None) -> LogCheck:
+def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int | None = None) -> LogCheck:
     """Look at `log` of `robot`: units, signs, order of the columns, clock, frame and time, what it covers.
 
     Nothing is fitted; a few hundred rows are solved. Raises `LogError` for a log without a dozen measured
     rows.
     """
+    robot = robot_of(robot)
+    log = log_of(log, robot)
     samples = sample(log)
     if len(samples.rows) < _LEAST:
         raise LogError(

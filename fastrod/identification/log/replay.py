@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fastrod.errors import InputError, LogError
 from fastrod.identification.log.inputs import base_of, inputs
+from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
-from fastrod.logs.runlog import RunLog
+from fastrod.logs.runlog import RunLog, log_of
 from fastrod.model.robot import Robot
 from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats, Ints
@@ -108,14 +110,15 @@ class Replay:
 
 @one_blas_thread
 def replay(
-    log: RunLog,
-    robot: Robot,
+    log: RunLog | str | Path,
+    robot: Robot | str | Path,
     *,
     simulator: Callable[..., Any] | None = None,
     dynamics: bool = False,
     progress: Progress | None = None,
 ) -> Replay:
-    """The model's answer to every row of `log`, each row one robot of a batch.
+    """The model's answer to every row of `log`, each row one robot of a batch. Both may be given by their
+    files, and a shipped robot by its name.
 
     Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins
     at rest. The measured frame is taken as the robot's base frame: nothing is registered and nothing is
@@ -126,6 +129,8 @@ def replay(
     rows done and the rows in all. Raises `LogError` where no row of the log can be compared, `InputError` for
     a robot that lengths do not drive.
     """
+    robot = robot_of(robot)
+    log = log_of(log, robot)
     _check_driven_by_lengths(robot)
     if not log.measured.any():
         raise LogError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from fastrod.identification.search.solve import Estimate
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHORT = 10.0
 """s; of a shorter log no shares are given: its held-out stretches are half a second each."""
@@ -84,7 +87,7 @@ class SearchStage:
     """Distance rms [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Result:
     """Everything that `identify` found. Lengths in metres, base frame."""
 
@@ -147,6 +150,22 @@ class Result:
     """The same command at other times, before and after; None where too few come again."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
+
+    def plot(self) -> Figure:
+        """Draw what is left over time, before and after, and on data held out; a figure of matplotlib."""
+        from fastrod.identification.report.plot import plot_result
+
+        return plot_result(self)
+
+    def _repr_html_(self) -> str:
+        from fastrod.identification.report.plot import html_of
+
+        return html_of(self)
+
+    def __repr__(self) -> str:
+        found = ", ".join(each.name for each in self.effects) or "no effect"
+        errors = f"held out {1e3 * self.test.before:.3g} to {1e3 * self.test.after:.3g} mm"
+        return f"Result({self.log.name!r} on {self.robot.name!r}: {self.verdict}, {found}, {errors})"
 
     @property
     def above_noise(self) -> float:
