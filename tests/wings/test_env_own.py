@@ -258,3 +258,22 @@ def test_a_robot_that_does_not_suit_is_refused_in_a_sentence(robot: Any, sentenc
 def test_no_other_task_takes_a_robot() -> None:
     with pytest.raises(InputError, match="no option 'robot'"):
         BatchEnv("ReachObstacle", 1, robot="prototype")
+
+
+def test_a_task_in_a_file_is_known_by_its_path(tmp_path: Path) -> None:
+    """To the commands and to a batch, and by its id afterwards; what cannot be run is one sentence."""
+    file = tmp_path / "aiming.py"
+    file.write_text(AIM.replace("Aim", "Aiming"))
+    try:
+        batch = BatchEnv(f"{file}:Aiming", 2)
+        assert batch.reset(seed=0)[0].shape[0] == 2
+        assert BatchEnv("fastrod/Aiming-v0").task.name == "Aiming"
+        with pytest.raises(UnknownNameError, match=r"no task 'Aimin' in .*did you mean 'Aiming'"):
+            registration.name_of(f"{file}:Aimin")
+    finally:
+        registration.unregister("Aiming")
+    with pytest.raises(InputError, match=r"task file '.*none.py' cannot be read"):
+        registration.name_of(f"{tmp_path / 'none.py'}:Aim")
+    (tmp_path / "broken.py").write_text("1 / 0")
+    with pytest.raises(InputError, match=r"cannot be run: ZeroDivisionError"):
+        registration.name_of(f"{tmp_path / 'broken.py'}:Aim")

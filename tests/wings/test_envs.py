@@ -286,3 +286,39 @@ def test_huge_actions_are_finite() -> None:
     assert_array_equal(env.step(np.ones(env.action_space.shape))[0], huge)
     with pytest.raises(InputError, match="environment 0 is not finite"):
         env.step(np.array([[np.inf], [-np.inf]]) * np.ones(env.action_space.shape))
+
+
+def test_episodes_that_begin_in_the_next_step_are_the_same_episodes() -> None:
+    """As Gymnasium's vector wrappers want it: the step after an end heeds no action and brings no reward."""
+    same, following = (BatchEnv("Reach", 3, autoreset=mode) for mode in ("same_step", "next_step"))
+    first = [batch.reset(seed=5)[0] for batch in (same, following)]
+    assert_array_equal(*first)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (same.n_steps, *same.action_space.shape))
+    for action in actions:
+        begun, *_, info = same.step(action)
+        ended, _, _, truncated, own = following.step(action)
+    assert truncated.all()
+    assert_array_equal(np.stack(info["final_obs"]), ended)
+    assert_array_equal(own["final_info"]["episode"]["r"], info["final_info"]["episode"]["r"])
+    after, reward, terminated, truncated, _ = following.step(actions[0])
+    assert_array_equal(after, begun)
+    assert not np.stack([reward, terminated, truncated]).any()
+    assert following.elapsed.tolist() == [0, 0, 0]
+    later = [batch.step(actions[1])[0] for batch in (same, following)]
+    assert_array_equal(*later)
+
+
+def test_vector_wrappers_of_gymnasium_take_a_batch() -> None:
+    from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+    env = RecordEpisodeStatistics(NormalizeObservation(BatchEnv("Reach", 2, autoreset="next_step")))
+    env.reset(seed=0)
+    lengths = []
+    for _ in range(45):
+        observation, _, _, truncated, info = env.step(env.action_space.sample())
+        assert np.isfinite(observation).all()
+        if truncated.any():
+            lengths += info["episode"]["l"].tolist()
+    assert lengths == [40, 40]
+    with pytest.raises(InputError, match="autoreset is 'never'; known: next_step, same_step"):
+        BatchEnv("Reach", autoreset="never")  # type: ignore[arg-type]

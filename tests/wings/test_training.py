@@ -168,6 +168,20 @@ def test_lessons_bring_the_policy_to_the_baseline() -> None:
     assert ends() < 0.5 * untaught
 
 
+def test_normalised_observations_of_stable_baselines() -> None:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from fastrod_envs import sb3
+
+    env = VecNormalize(sb3.make("Reach", 4, reward="precise"))
+    env.reset()
+    for _ in range(45):
+        observation, *_ = env.step(np.zeros((4, *env.action_space.shape)))
+    assert np.isfinite(observation).all()
+    with pytest.raises(InputError, match="autoreset='same_step'"):
+        sb3.make("Reach", 2, autoreset="next_step")
+
+
 def test_the_adapter_tells_what_stable_baselines_asks_for() -> None:
     env = BatchVecEnv(BatchEnv("Reach", num_envs=4, n_steps=3))
     env.seed(7)

@@ -135,7 +135,7 @@ class Playback:
         if frames < 2:
             raise InputError(f"frames is {frames!r}; a playback keeps 2 at least.")
         samples = _samples(log)
-        log, n = samples.log, len(samples.log)
+        log, n = samples.log.rows(samples.given), len(samples.given)
         time, breaks = _clock(log)
         kept = np.arange(n) if n <= frames else np.linspace(0, n - 1, frames).round().astype(np.int64)
         robots = [before] if after is None else [before, after]
@@ -153,7 +153,7 @@ class Playback:
         return Playback(
             log=log,
             nominal=nominal or before,
-            origin=samples.origin,
+            origin=samples.origin[samples.given],
             time=time,
             breaks=breaks,
             frames=kept,
@@ -274,7 +274,7 @@ def identify(
         findings=findings,
         frames=frames,
     )
-    return replace(made, origin=playback.origin[made.origin], tested=result.tested)
+    return replace(made, origin=playback.origin[made.origin])
 
 
 def with_effects(names: Sequence[str]) -> str:
@@ -386,7 +386,8 @@ def _tested(samples: Any, findings: Findings | None) -> Flags | None:
         else list(findings.held_out)
     )
     try:
-        return held_out_rows(samples, words)[0]
+        held: Flags = held_out_rows(samples, words)[0][samples.given]
+        return held
     except FastrodError:
         return None  # the report is of several logs, whose runs have other names there
 
@@ -431,7 +432,8 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
         position, rotation, arclength = state.position, state.rotation, state.arclength
     else:
         model = known_model(robot)
-        place = forward.prepare_log(forward.sample(log).on(frames), robot, model.wiring)
+        samples = forward.sample(log)
+        place = forward.prepare_log(samples.on(samples.given[frames]), robot, model.wiring)
         effects = forward.effects_at(model, np.zeros(0))
         sim = Simulator(bare, n_robots=len(frames), points_per_segment=forward.N_STEPS)
         _, opened, _ = place.solve(effects, forward.PredictedRod(place.samples, robot), robot)

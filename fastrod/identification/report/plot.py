@@ -1,4 +1,4 @@
-"""Picture of a result, for a notebook: what is left over time, before and after."""
+"""Picture of what a result leaves, for a notebook."""
 
 from __future__ import annotations
 
@@ -6,59 +6,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fastrod.types import Flags, Floats
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fastrod.identification.report.result import Result
 
-
-def plot_result(result: Result) -> Figure:
-    """Distance between measured and predicted tip [mm] over the samples of the log, before and after, and how
-    it spreads on data held out; held-out stretches are shaded."""
+def plot_errors(
+    time: Floats, before: Floats, after: Floats, held_out: Flags, noise: float, title: str
+) -> Figure:
+    """Distance between measured and predicted tip [mm] over `time` (n,), from the residuals `before` and
+    `after` (n, 3) [m], and how it spreads over the rows that are `held_out` (n,), which are shaded."""
     from matplotlib import pyplot
 
     figure, (over, spread) = pyplot.subplots(
         1, 2, figsize=(10.0, 3.2), width_ratios=(3.0, 1.0), layout="constrained", sharey=True
     )
-    time = np.arange(len(result.log)) if len(result.log.runs) > 1 else result.log.t - result.log.t[0]
-    each = (("before", result.residual_before, "#9ca3af"), ("after", result.residual_after, "#e4572e"))
-    bins = None
-    for label, residual, colour in each:
-        size = 1e3 * np.linalg.norm(residual, axis=1)
+    sizes = [1e3 * np.linalg.norm(residual, axis=1) for residual in (before, after)]
+    bins = np.linspace(0.0, float(np.nanmax(sizes[0], initial=1e-3)), 41)
+    for size, label, colour in zip(sizes, ("before", "after"), ("#9ca3af", "#e4572e"), strict=True):
         over.plot(time, size, color=colour, lw=0.7, label=label)
-        held = size[result.tested & np.isfinite(size)]
-        if held.size:
-            bins = np.linspace(0.0, float(held.max()), 41) if bins is None else bins
-            spread.hist(held, bins, color=colour, alpha=0.7, orientation="horizontal")
-    over.fill_between(
-        time,
-        0.0,
-        1.0,
-        where=result.tested,
-        transform=over.get_xaxis_transform(),
-        color="#2a78b5",
-        alpha=0.08,
-        lw=0.0,
-    )
-    over.axhline(1e3 * result.noise.floor, color="black", lw=0.8, ls="--", label="noise")
-    over.set(xlabel="row" if len(result.log.runs) > 1 else "t [s]", ylabel="tip error [mm]", ylim=(0.0, None))
+        spread.hist(
+            size[held_out & np.isfinite(size)], bins, color=colour, alpha=0.7, orientation="horizontal"
+        )
+    shade = {"transform": over.get_xaxis_transform(), "color": "#2a78b5", "alpha": 0.08, "lw": 0.0}
+    over.fill_between(time, 0.0, 1.0, where=held_out, **shade)
+    over.axhline(1e3 * noise, color="black", lw=0.8, ls="--", label="noise")
+    over.set(xlabel="t [s]", ylabel="tip error [mm]", ylim=(0.0, None))
     over.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize=8)
     spread.set(xlabel="held-out rows")
-    found = ", ".join(each.name.replace("_", " ") for each in result.effects) or result.verdict.replace(
-        "_", " "
-    )
-    over.set_title(f"{result.log.name} on {result.robot.name}: {found}", loc="left", fontsize=10)
+    over.set_title(title, loc="left", fontsize=10)
     return figure
-
-
-def html_of(result: Result) -> str:
-    """The summary and its tables, as the command prints them."""
-    import io
-
-    from rich.console import Console
-
-    from fastrod.identification.report.report import table
-
-    console = Console(record=True, file=io.StringIO(), width=100)
-    console.print(table(result))
-    return console.export_html(inline_styles=True, code_format="<pre style='line-height:1.2'>{code}</pre>")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -152,20 +153,32 @@ class Result:
     """Held-out rms with a network on what is left, where one was asked for."""
 
     def plot(self) -> Figure:
-        """Draw what is left over time, before and after, and on data held out; a figure of matplotlib."""
-        from fastrod.identification.report.plot import plot_result
+        """Draw what is left over time, before and after, runs one after the other, and on data held out; a
+        figure of matplotlib."""
+        from fastrod.identification.report.plot import plot_errors
 
-        return plot_result(self)
+        t, step = self.log.t, np.diff(self.log.t, prepend=self.log.t[:1])
+        step[np.flatnonzero(self.log.run[1:] != self.log.run[:-1]) + 1] = 0.0
+        title = f"{self.log.name} on {self.robot.name}: {self._found.replace('_', ' ')}"
+        errors = self.residual_before, self.residual_after
+        return plot_errors(np.cumsum(step) if len(t) else t, *errors, self.tested, self.noise.floor, title)
+
+    @property
+    def _found(self) -> str:
+        return ", ".join(each.name for each in self.effects) or self.verdict
 
     def _repr_html_(self) -> str:
-        from fastrod.identification.report.plot import html_of
-
-        return html_of(self)
+        rows = "".join(
+            f"<tr><td>{each.name}</td><td>{name}</td>"
+            f"<td>{e.value:.5g} &plusmn; {e.stderr:.2g} {e.unit}</td></tr>"
+            for each in self.effects
+            for name, e in each.parameters.items()
+        )
+        return f"<p><b>{self.verdict}</b> {html.escape(self.summary)}</p><table>{rows}</table>"
 
     def __repr__(self) -> str:
-        found = ", ".join(each.name for each in self.effects) or "no effect"
         errors = f"held out {1e3 * self.test.before:.3g} to {1e3 * self.test.after:.3g} mm"
-        return f"Result({self.log.name!r} on {self.robot.name!r}: {self.verdict}, {found}, {errors})"
+        return f"Result({self.log.name!r} on {self.robot.name!r}: {self.verdict}, {self._found}, {errors})"
 
     @property
     def above_noise(self) -> float:
