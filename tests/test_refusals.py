@@ -122,7 +122,7 @@ INPUTS: Rows = [
     (lambda: settle(tendon_length=[0.001, 0.0, -0.001, 0.0]), "Add Robot.rest_tendon_length"),
     (lambda: settle(tendon_length=[np.nan] * 4), "not finite"),
     (lambda: settle(tendon_length=[-0.07] * 4), "impossible"),
-    (lambda: settle(), "tendon_length is missing"),
+    (lambda: three().step(), "tendon_length is missing"),
     (lambda: settle(LENGTHS, tip_force=[1.0, 2.0]), r"tip_force has shape \(2,\)"),
     (lambda: settle(LENGTHS, extension=[0.01]), "outside the range"),
     (lambda: settle(LENGTHS, point_force=[(0.1, (0, 0, 1))]), "the rod runs from 0 to 0.07"),

@@ -429,6 +429,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "new": own.new,
     "import": own.bring,
     "check": own.check,
+    "export": own.export,
     "view": _view,
     "drive": _drive,
     "envs": _envs,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "look": ("demo", "view"),
-    "your robot and your log": ("new", "check", "import"),
+    "your robot and your log": ("new", "check", "import", "export"),
     "measure and explain": ("excite", "drive", "identify", "replay"),
     "learn": ("envs", "train", "evaluate"),
     "scale and compare": ("generate", "bench", "warmup"),

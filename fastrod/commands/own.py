@@ -78,6 +78,7 @@ _FILE = (
         "positive", "a positive motor value pulls, or pays out?", "pays-out", _one_of(["pulls", "pays-out"])
     ),
 )
+_COMMANDS = 10, 3  # that are compared with the rod, of one segment or two, and of more
 _COLUMNS = ("time-column", "motor-columns", "tip-columns")
 
 
@@ -95,6 +96,13 @@ def add_commands(commands: argparse._SubParsersAction[Any]) -> None:
             f"--{name}", metavar="NAMES", help="of the log, separated by commas (default: guessed)"
         )
     new.add_argument("--force", action="store_true", help="write over a file that is there")
+
+    export = commands.add_parser("export", help="a robot as a chain of joints with tendons, for MuJoCo")
+    export.add_argument("robot", metavar="ROBOT", help="a shipped robot's name or a path to a .toml")
+    export.add_argument("--mjcf", type=Path, required=True, metavar="FILE", help="file to write, .xml")
+    export.add_argument(
+        "--pieces", type=int, metavar="N", help="of a segment (default: 16, 24 of three and more)"
+    )
 
     brings = commands.add_parser("import", help="your own log file as a run log: CSV, Parquet, MATLAB")
     check = commands.add_parser("check", help="is this a log of this robot, and what can it reveal?")
@@ -157,6 +165,32 @@ def bring(arguments: argparse.Namespace) -> int:
     log = read_log(arguments.log, replace(robot, log=replace(robot.log, clock=0.0)))
     write_log(log, path)
     print(f"wrote {path}: {len(log)} rows, {log.dl.shape[1]} tendons")
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """Write a robot as MJCF, with its static error against the rod."""
+    from importlib.util import find_spec
+
+    from fastrod.hosts.mjcf import mjcf, static_error
+    from fastrod.loading import load_robot
+
+    robot, pieces = load_robot(arguments.robot), arguments.pieces
+    if arguments.mjcf.suffix != ".xml":
+        raise InputError(f"{str(arguments.mjcf)!r} does not end in .xml; a file of MuJoCo does.")
+    if pieces is not None and not 4 <= pieces <= 200:
+        raise InputError(f"--pieces is {pieces}; give a whole number from 4 to 200.")
+    mjcf(robot, pieces=pieces)  # refuses before anything is computed
+    said = "static error not measured: MuJoCo is not installed"
+    if find_spec("mujoco") is not None:
+        count = _COMMANDS[robot.n_segments > 2]
+        error = static_error(robot, pieces=pieces, count=count)
+        said = (
+            f"at rest the tip is within {100.0 * error:.2g} % of the length of where fastrod has it, the "
+            f"worst of {count} random commands"
+        )
+    arguments.mjcf.write_text(mjcf(robot, pieces=pieces, comment=f"robot {robot.name} by fastrod; {said}"))
+    print(f"wrote {arguments.mjcf}; {said}")
     return 0
 
 
