@@ -50,5 +50,5 @@ def html_of(tip_position: Floats, tensions: Floats, ok: Flags, problems: Mapping
         rows.append(f"<tr><td>{i}</td><td>{tip}</td><td>{tension}</td><td>{said}</td></tr>")
     more = len(ok) - len(rows)
     head = "".join(f"<th>{name}</th>" for name in ("robot", "tip [mm]", "tension [N]", ""))
-    foot = f"<tr><td colspan=4>and {more} more</td></tr>" if more else ""
-    return f"<table><tr>{head}</tr>{''.join(rows)}{foot}</table>"
+    rest = f"<tr><td colspan=4>and {more} more</td></tr>" if more else ""
+    return f"<table><tr>{head}</tr>{''.join(rows)}{rest}</table>"

@@ -66,9 +66,9 @@ def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int |
     if clock:
         samples = sample(on_one_clock(log, clock))
     reading = read(samples, robot, threads=threads)
-    asked = [clock_sentence(log, clock)] if clock else []
+    questions = [clock_sentence(log, clock)] if clock else []
     if reading.registration is not None:
-        asked.append(reading.registration.sentence())
+        questions.append(reading.registration.sentence())
     columns, found, left = None, robot, left_by(samples, robot, threads)
     if reading.questions and robot.n_tendons:
         columns, found, least = _matched(samples, robot, threads)
@@ -79,7 +79,7 @@ def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int |
     return LogCheck(
         facts=_facts(samples, robot, bend, left),
         refusal=reading.refusal,
-        questions=(*asked, *(each for each in reading.questions if each != reading.refusal)),
+        questions=(*questions, *(each for each in reading.questions if each != reading.refusal)),
         shows=tuple(can for there, can, _ in said if there),
         lacks=tuple(cannot for there, _, cannot in said if not there),
         columns=columns,
@@ -170,8 +170,10 @@ def _facts(samples: LogSamples, robot: Robot, bend: Floats, left: float) -> dict
         octant = np.floor(_OCTANTS * (np.arctan2(bend[..., 1], bend[..., 0]) / (2.0 * np.pi) + 0.5))
         said = []
         for k, most in enumerate(size.max(axis=0)):
-            ways = len(np.unique(octant[size[:, k] > _BENT * max(most, 1e-6), k] % _OCTANTS))
-            said.append(f"segment {k + 1} to {np.degrees(most):.0f} deg in {ways} of {_OCTANTS} directions")
+            covered = len(np.unique(octant[size[:, k] > _BENT * max(most, 1e-6), k] % _OCTANTS))
+            said.append(
+                f"segment {k + 1} to {np.degrees(most):.0f} deg in {covered} of {_OCTANTS} directions"
+            )
         facts["bends"] = "; ".join(said)
     moves = float(np.sqrt(((tip - tip.mean(axis=0)) ** 2).sum(1).mean()))
     facts["tip"] = f"moves {1e3 * moves:.3g} mm about its mean, rms"

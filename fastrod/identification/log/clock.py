@@ -15,6 +15,7 @@ from fastrod.identification.log.registration import align
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
+from fastrod.types import Ints
 
 MARGIN = 0.2
 """Delay [s] that is left for the fit to find once commands are laid on the camera's clock, so that it may
@@ -22,7 +23,8 @@ come out smaller as well as larger: 0.54 mm of play made a first look 0.1 s wron
 LONGEST = 1.0
 """Offset that is looked for [s]."""
 _STEPS = 10  # of the offsets on each side, and of each of these steps
-_STRETCHES, _ROWS = 6, 250  # of consecutive samples that are solved
+_STRETCHES, _LASTS = 5, 7.0  # of time that are looked at; s
+_FINEST, _COARSEST = 0.06, 0.25  # s between rows of these
 _LEAST = 30  # of them compared
 _BETTER = 0.8  # of what is left without it: less is the offset's merit
 
@@ -66,16 +68,18 @@ def clock_sentence(log: RunLog, offset: float) -> str:
     )
 
 
-def _stretches(samples: LogSamples) -> list[np.ndarray]:
-    """Rows of consecutive samples, evenly over the runs that are long enough and dense enough to tell an
+def _stretches(samples: LogSamples) -> list[Ints]:
+    """Rows of stretches of time, evenly over the runs that are long enough and dense enough to tell an
     offset."""
-    found: list[np.ndarray] = []
+    found: list[Ints] = []
     for span in samples.runs:
-        count = min(_ROWS, span.stop - span.start)
-        for first in np.linspace(span.start, span.stop - count, _STRETCHES).astype(int):
-            rows = np.arange(first, first + count)
-            lasts = samples.time[rows[-1]] - samples.time[rows[0]]
-            if lasts > 3.0 * LONGEST and lasts < LONGEST * count / 4.0:
+        time = samples.time[span]
+        step = float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+        if time[-1] < _LASTS or not 0.0 < step < _COARSEST:
+            continue
+        for first in np.linspace(0.0, time[-1] - _LASTS, _STRETCHES):
+            inside = np.flatnonzero((time >= first) & (time <= first + _LASTS))
+            rows = span.start + inside[:: max(1, round(_FINEST / step))]
+            if len(rows) >= _LEAST:
                 found.append(rows)
-    every = max(1, len(found) // _STRETCHES)
-    return found[::every][:_STRETCHES]
+    return found[:: max(1, len(found) // _STRETCHES)][:_STRETCHES]
