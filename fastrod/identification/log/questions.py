@@ -53,6 +53,7 @@ _RIGHT = (
     "this robot?"
 )
 _PACE = 1.0  # s from row to row; a dense log that takes longer has its time in another unit
+_SLOWEST = 4.0  # s: such a log is refused; the rows of a grid, measured one by one, have 1 s each
 _DENSE = 0.1  # of the motion from row to row
 
 
@@ -94,8 +95,9 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
     """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
     late = "" if "time" in robot.log.units else time_question(samples)
     questions = [late] if late else []
+    wrong = late if _pace(samples) >= _SLOWEST else ""
     look = _Look(samples, robot, threads)
-    nothing = Reading(registration=None, questions=tuple(questions), refusal=late, guess="")
+    nothing = Reading(registration=None, questions=tuple(questions), refusal=wrong, guess="")
     frame, far = look.frame, look.frame.is_large(robot.length)
     # a small misalignment is for the search to name
     as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)
@@ -134,7 +136,7 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
             )
     further = look.centred > _FURTHER * look.motion and not (moved and not guess)
     name = samples.log.name
-    refusal = late
+    refusal = wrong
     if further:
         questions.append(further_than_still(samples, robot, look.scale, guess))
     elif guess:
@@ -175,11 +177,9 @@ def further_than_still(samples: LogSamples, robot: Robot, scale: float, guess: s
 
 def time_question(samples: LogSamples) -> str:
     """Whether the time of a dense log is in another unit; empty where it is not."""
-    steps = samples.dt[samples.dt > 0.0]
-    tip = np.asarray(samples.log.tip_position)[samples.rows]
-    if len(steps) < _LEAST or len(tip) < _LEAST:
+    tip, pace = np.asarray(samples.log.tip_position)[samples.rows], _pace(samples)
+    if len(tip) < _LEAST:
         return ""
-    pace = float(np.median(steps))
     motion = size(tip - np.median(tip, axis=0))
     if pace < _PACE or size(np.diff(tip, axis=0)) > _DENSE * motion:
         return ""
@@ -188,6 +188,12 @@ def time_question(samples: LogSamples) -> str:
         f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes "
         'seconds, or [log] units = {time = "ms"} in the robot file, and "s" where it is so slow.'
     )
+
+
+def _pace(samples: LogSamples) -> float:
+    """Median time from row to row [s]; 0 where too few tell."""
+    steps = samples.dt[samples.dt > 0.0]
+    return float(np.median(steps)) if len(steps) >= _LEAST else 0.0
 
 
 class _Look:
