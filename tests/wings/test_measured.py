@@ -3,14 +3,18 @@ where they are there."""
 
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from fastrod import load_robot
+from fastrod.commands.cli import main
 from fastrod.errors import LogError, UnknownNameError
 from fastrod.identification.log.base_model import base_model
+from fastrod.identification.log.check import check
 from fastrod.logs.runlog import read_log, write_log
 from fastrod.logs.table import read_table
 from fastrod.model.robotfile import dumps, loads
@@ -236,3 +240,39 @@ def test_cells_of_the_tdcr_cover_its_cube_of_shortenings() -> None:
         pull = -log.dl[rows]
         assert (pull >= low - 1e-12).all()
         assert (pull < low + measured.ARMLAB_CELL + 1e-12).all()
+
+
+@needs_data
+@pytest.mark.study(beyond=1)
+@pytest.mark.parametrize("name", ["opencr_ftv4_train", "asl_trunk", "armlab_tdcr", "ethz_beam"])
+def test_a_first_look_at_a_measured_set_refuses_nothing(name: str) -> None:
+    log, robot = measured.read(DATA / f"{name}.csv", None)
+    found = check(log, robot)
+    assert found.refusal == ""
+    assert found.columns is None
+
+
+@needs_data
+@pytest.mark.study
+def test_order_signs_and_angles_of_nine_servos_are_found_from_the_authors_file(tmp_path: Path) -> None:
+    """From a file that knows nothing of them: each segment's tendons at any angle, positive pulls."""
+    raw = DATA / "opencr_ftv4_train.csv"
+    words = "--segments 3 --tendons 3 --length 60,62.5,64 --offset 4.5 --drive pull"
+    assert main(["new", str(tmp_path / "a.toml"), "--log", str(raw), *words.split()]) == 0
+    assert (
+        main(["check", str(raw), "--robot", str(tmp_path / "a.toml"), "--out", str(tmp_path / "b.toml")]) == 0
+    )
+    found = load_robot(tmp_path / "b.toml")
+    _, built = opencr_ftv4(raw)
+    servos = [int(re.findall(r"\d", found.log.sources[f"dl_{k}"])[0]) for k in range(1, 10)]
+    assert found.log.sign == -1
+    off = []
+    for k, (servo, tendon) in enumerate(zip(servos, found.tendons, strict=True)):
+        true = measured.OPENCR_SERVOS.index(servo)
+        assert true // 3 == k // 3
+        off.append(
+            math.remainder(float(np.mean(tendon.angle)) - float(np.mean(built.tendons[true].angle)), math.tau)
+        )
+    # the camera's own angle apart; those of the set are rounded to 30 deg
+    assert np.ptp(off) < math.radians(15.0)
+    assert abs(np.mean(off)) < math.radians(15.0)
