@@ -258,13 +258,21 @@ def _answer(question: _Question, arguments: argparse.Namespace, ask: bool, guess
     while True:
         typed = given
         if given is None:
-            typed = input(f"{question.text} [{default}]: ").strip() if ask else ""
+            typed = _typed(f"{question.text} [{default}]: ") if ask else ""
         try:
             return question.read(str(typed or default))
         except ValueError as error:
             if given is not None or not ask:
                 raise InputError(f"--{question.name} is {typed or default!r}; {error}.") from None
             print(error, file=sys.stderr)
+
+
+def _typed(prompt: str) -> str:
+    """A line from the terminal; empty at its end."""
+    try:
+        return input(prompt).strip()
+    except EOFError:
+        return ""
 
 
 def _robot_text(name: str, given: dict[str, Any]) -> str:
