@@ -261,12 +261,10 @@ def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> 
     assert "small" in str(caught.value)
 
 
-@pytest.mark.study
-def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
-    """Half of the motion is as predicted, so it is not refused; but no effect is made of it."""
-    result = identify(other([1, 0, 2, 3]), robot(), threads=1)
-    assert result.verdict == "not_in_library"
-    assert list(result.effects) == []
+def test_neighbouring_columns_that_are_swapped_are_refused() -> None:
+    """Half of the motion is as predicted, but another order follows it far better."""
+    with pytest.raises(LogError, match="times as closely with dl_1 and dl_2 exchanged"):
+        identify(other([1, 0, 2, 3]), robot(), threads=1)
 
 
 def test_too_much_held_out_is_refused() -> None:

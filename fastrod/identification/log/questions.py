@@ -109,7 +109,11 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
     enough = as_it_is / _MANY if follows else min(_FOLLOWS * look.motion, _BETTER * as_it_is)
     moved = far and frame.left < enough
     tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
-    left, words = min(tried, default=(np.inf, ""))
+    least = 1.02 * min((left for left, _ in tried), default=np.inf)
+    # of readings that are alike the one that is said in the fewest words
+    left, words = min(
+        (pair for pair in tried if pair[0] <= least), key=lambda pair: len(pair[1]), default=(np.inf, "")
+    )
     mixed_up = left < enough
     # a rotation about the base's axis looks like other signs or another order: then the columns are asked for
     if mixed_up and moved:
