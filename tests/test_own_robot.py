@@ -42,11 +42,9 @@ def lab() -> Robot:
                 length=length,
                 bending_stiffness=(0.004, 0.004),
                 torsional_stiffness=0.003,
-                tendons=tuple(
-                    Tendon(offset=0.009, angle=np.remainder(first + 2.1 * i, 6.2)) for i in range(3)
-                ),
+                tendons=tuple(Tendon(offset=0.009, angle=first + 2.0944 * i) for i in range(3)),
             )
-            for length, first in ((0.1, 0.0), (0.09, 1.0))
+            for length, first in ((0.1, 0.0), (0.09, 1.0472))
         ),
     )
 
@@ -224,19 +222,7 @@ def test_three_commands_from_a_file_of_ones_own(
 ) -> None:
     """Milliseconds, degrees, millimetres, positive pulls, an order of their own: no converter."""
     monkeypatch.chdir(tmp_path)
-    real = Robot(
-        name="real",
-        segments=tuple(
-            Segment(
-                length=length,
-                bending_stiffness=(0.01, 0.01),
-                torsional_stiffness=0.0077,
-                tendons=tuple(Tendon(offset=0.009, angle=first + 2.0944 * i) for i in range(3)),
-            )
-            for length, first in ((0.1, 0.0), (0.09, 1.0472))
-        ),
-    )
-    log = measured(real)
+    log = measured(lab())
     order = [4, 2, 0, 5, 1, 3]
     names = tuple(f"motor{c}_deg" for c in "ABCDEF")
     theirs = LogFormat(
