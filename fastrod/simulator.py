@@ -502,6 +502,15 @@ class Simulator(Motions):
         return self._engine
 
     @one_blas_thread
+    def markers(self) -> tuple[Floats, Floats]:
+        """The first robot's `log_points` of the last state, with their offsets from the backbone: world
+        (n_robots, k, 3) [m], and world_from_material (n_robots, k, 3, 3) of their cross-sections. On a robot
+        that is shortened below a point's arclength, that point is at its tip."""
+        robot, end = self.robots[0], float(np.nanmin(self._full("markers").arclength[:, -1]))
+        found = self.shape(np.minimum(np.array(robot.log_points), end))
+        offset = np.array(robot.log_offsets or [(0.0, 0.0)] * len(robot.log_points))
+        return found.position + np.einsum("nkij,kj->nki", found.rotation[..., :2], offset), found.rotation
+
     def measure(self) -> SensedPoses:
         """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in
         the base frame, effects of sensing included. Effects before the rod show in the state itself. Raises
@@ -509,6 +518,6 @@ class Simulator(Motions):
         state, ports = self._last("measure")
         points = np.zeros((self.n_robots, 0, 3))
         if self.outputs == "full" and self.robots[0].log_points:
-            points = self.shape(np.array(self.robots[0].log_points)).position - ports.base_pose[:, None, :3]
+            points = self.markers()[0] - ports.base_pose[:, None, :3]
         seen = from_base(ports.base_pose, state.tip_position, state.tip_rotation, points)
         return self._chain.sense(seen, ports, self._plain, self.dt, self._layout.n_steps)

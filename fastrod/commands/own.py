@@ -18,8 +18,8 @@ from fastrod.logs.table import Table, read_table
 from fastrod.model.logformat import UNITS
 from fastrod.model.robotfile import loads
 
-_UNIT = re.compile(r"[_\s\[(]+(ms|us|ns|sec|s|mm|cm|um|m|deg|rad|rev)[\])]?$", re.IGNORECASE)
-_DRIVES = {"pull": True, "push-pull": False}
+_UNIT = re.compile(r"[_\s\[(]+(ms|us|ns|sec|s|mm|cm|um|m|deg|rad|rev|n|mn|kgf|gf)[\])]?$", re.IGNORECASE)
+_DRIVES = ("pull", "push-pull", "force")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,13 @@ def _positive(text: str) -> list[float]:
     values = _numbers(text)
     if not values or not all(math.isfinite(v) and v > 0.0 for v in values):
         raise ValueError("give a positive number, or one for each segment")
+    return values
+
+
+def _ends(text: str) -> list[float]:
+    values = _positive(text)
+    if len(values) > 2:
+        raise ValueError("give one radius, or two: at base and tip")
     return values
 
 
@@ -66,13 +73,23 @@ _ROBOT = (
     _Question("offset", "distance of the tendons from the axis [mm]", "8", _positive),
     _Question("angle", "direction of each segment's first tendon, from x toward y [deg]", "0", _numbers),
     _Question(
-        "drive", "do drives pull only, or push too (pull, push-pull)?", "push-pull", _one_of([*_DRIVES])
+        "drive",
+        "drives move tendons that pull, push too, or give forces (pull, push-pull, force)?",
+        "push-pull",
+        _one_of(_DRIVES),
     ),
+)
+_MATERIAL = (
+    _Question("radius", "radius of the body [mm], or at base and tip; tendons keep their share", "12", _ends),
+    _Question("youngs-modulus", "Young's modulus [kPa]", "100", _positive),
+    _Question("density", "density [kg/m^3]", "1070", _positive),
 )
 _FILE = (
     _Question("time-unit", "unit of time", "s", _one_of([*UNITS["time"]])),
     _Question("tip-unit", "unit of the measured tip", "m", _one_of([*UNITS["length"]])),
-    _Question("motor-unit", "unit of the motors", "m", _one_of([*UNITS["length"], *UNITS["angle"]])),
+    _Question(
+        "motor-unit", "unit of the motors", "m", _one_of([*UNITS["length"], *UNITS["angle"], *UNITS["force"]])
+    ),
     _Question("drum-radius", "radius of the drums [mm]", "10", _positive),
     _Question(
         "positive", "a positive motor value pulls, or pays out?", "pays-out", _one_of(["pulls", "pays-out"])
@@ -87,7 +104,15 @@ def add_commands(commands: argparse._SubParsersAction[Any]) -> None:
     new = commands.add_parser("new", help="write a robot file of your own: asks, or takes options")
     new.add_argument("file", type=Path, metavar="FILE", help="robot file to write, .toml")
     new.add_argument("--log", type=Path, metavar="LOG", help="your log: its columns and units are guessed")
-    for question in (*_ROBOT, *_FILE):
+    new.add_argument(
+        "--markers",
+        metavar="V",
+        help="arclengths of markers on the body, in place of the tip [mm]; columns as --tip-columns",
+    )
+    new.add_argument(
+        "--marker-offset", metavar="V", default="0", help="of the markers from the axis, along x [mm]"
+    )
+    for question in (*_ROBOT, *_MATERIAL, *_FILE):
         new.add_argument(
             f"--{question.name}", metavar="V", help=f"{question.text} (default: {question.default})"
         )
@@ -137,6 +162,11 @@ def new(arguments: argparse.Namespace) -> int:
                 f"--{name} has {len(values)} numbers; give one, or one for each of {segments} segments."
             )
         given[name] = values * segments if len(values) == 1 else values
+    given["markers"] = _positive(arguments.markers) if arguments.markers else []
+    beside = _numbers(arguments.marker_offset)
+    given["beside"] = beside * len(given["markers"]) if len(beside) == 1 else beside
+    if given["drive"] == "force":
+        given |= {question.name: _answer(question, arguments, ask) for question in _MATERIAL}
     text = _robot_text(path.stem, given)
     if arguments.log is not None:
         text += _log_text(read_table(arguments.log), arguments, given, ask)
@@ -164,7 +194,7 @@ def bring(arguments: argparse.Namespace) -> int:
     # a clock is the robot's, and applies to its run logs too
     log = read_log(arguments.log, replace(robot, log=replace(robot.log, clock=0.0)))
     write_log(log, path)
-    print(f"wrote {path}: {len(log)} rows, {log.dl.shape[1]} tendons")
+    print(f"wrote {path}: {len(log)} rows, {robot.n_tendons} tendons")
     return 0
 
 
@@ -233,9 +263,16 @@ def _mapping(found: Any) -> Any:
     from rich import box
     from rich.table import Table as Grid
 
-    robot, columns = found.robot, found.columns
+    robot, columns, forces = found.robot, found.columns, found.robot.by_tension
     grid = Grid(box=box.SIMPLE_HEAD, title="columns as they fit best", title_justify="left", pad_edge=False)
-    for name in ("segment", "tendon", "column", "positive", "angle deg", "tip mm per mm"):
+    for name in (
+        "segment",
+        "tendon",
+        "column",
+        "positive",
+        "angle deg",
+        f"tip mm per {'N' if forces else 'mm'}",
+    ):
         grid.add_column(name, justify="left" if name in ("column", "positive") else "right")
     for k, tendon in enumerate(robot.tendons):
         first = tendon.angle[0] if isinstance(tendon.angle, tuple) else tendon.angle
@@ -243,10 +280,10 @@ def _mapping(found: Any) -> Any:
         grid.add_row(
             str(int(robot.tendon_segment[k]) + 1),
             str(k + 1),
-            robot.log.sources[f"dl_{k + 1}"],
-            "pulls" if sign < 0 else "pays out",
+            robot.log.sources[f"{'tension' if forces else 'dl'}_{k + 1}"],
+            "pulls" if sign < 0 or forces else "pays out",
             f"{math.degrees(first):.0f}",
-            f"{np.linalg.norm(columns.answer[columns.order[k]]):.2g}",
+            f"{(1e3 if forces else 1.0) * np.linalg.norm(columns.answer[columns.order[k]]):.2g}",
         )
     return grid
 
@@ -282,24 +319,41 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
         "",
         "# Lengths in m, angles in rad, forces in N; z of the base points along the straight robot.",
     ]
-    pulls = _DRIVES[given["drive"]]
+    pulls, forces = given["drive"] == "pull", given["drive"] == "force"
+    ends = np.cumsum([0.0, *given["length"]]) / sum(given["length"])
     for k in range(given["segments"]):
-        offset, count = 1e-3 * given["offset"][k], given["tendons"][k]
-        lines += [
-            "",
-            "[[segment]]",
-            f"length = {1e-3 * given['length'][k]:.6g}",
-            "bending_stiffness = [0.01, 0.01]  # EI about d1, d2, N m^2: seen where loads bend the robot",
-            "torsional_stiffness = 0.0077      # GJ, N m^2",
-            f"body_radius = {1.2 * max(given['offset'][k:]) * 1e-3:.6g}",
-        ]
+        offset, count = f"{1e-3 * given['offset'][k]:.6g}", given["tendons"][k]
+        lines += ["", "[[segment]]", f"length = {1e-3 * given['length'][k]:.6g}"]
+        if forces:
+            base, tip = given["radius"][0], given["radius"][-1]
+            radius = [round(1e-3 * (base + (tip - base) * float(s)), 7) for s in ends]
+            even = base == tip
+            lines += [
+                f"body_radius = {radius[k] if even else radius[k : k + 2]}",
+                f"youngs_modulus = {1e3 * given['youngs-modulus'][0]:.6g}  # Pa",
+                "poisson = 0.5",
+                f"density = {given['density'][0]:.6g}",
+                'mode = "tendon_tension"  # a log gives the force on each tendon',
+            ]
+            if not even:
+                offset = str([round(given["offset"][k] * r / base, 7) for r in radius[: k + 2]])
+        lines += (
+            []
+            if forces
+            else [
+                "bending_stiffness = [0.01, 0.01]  # EI about d1, d2, N m^2: seen where loads bend the robot",
+                "torsional_stiffness = 0.0077      # GJ, N m^2",
+                f"body_radius = {1.2 * max(given['offset'][k:]) * 1e-3:.6g}",
+            ]
+        )
         if pulls:
             lines.append("axial_stiffness = 1e4             # EA, N: tendons that pull shorten the body")
-        extra = ", compliance = 4e-5, pretension = 2.0, unilateral = true" if pulls else ""
+        extra = ", compliance = 4e-5, pretension = 2.0" if pulls else ""
+        extra += ", unilateral = true" if pulls or forces else ""
         lines.append("tendons = [  # angle: from x toward y; compliance in m/N")
         for i in range(count):
             angle = math.remainder(math.radians(given["angle"][k]) + 2.0 * math.pi * i / count, 2.0 * math.pi)
-            lines.append(f"    {{ offset = {offset:.6g}, angle = {angle:.6g}{extra} }},")
+            lines.append(f"    {{ offset = {offset}, angle = {angle:.6g}{extra} }},")
         lines.append("]")
     lines += ["", "[fit]  # what is not known exactly: standard deviations of priors"]
     lines += ['"tendon.*.angle" = { sd = 0.1 }', '"tendon.*.gain" = { sd = 0.1 }'] if pulls else []
@@ -309,6 +363,9 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
             '"tendon.*.pretension" = { sd = 4.0 }',
         ]
         lines += ['"segment.*.axial_stiffness" = { sd = 1e4 }']
+    if forces:
+        lines += ['"material.youngs_modulus" = { sd = 0.5 }', '"material.density" = { sd = 0.1 }']
+        lines += ['"material.taper" = { sd = 0.1 }']
     lines += [
         "",
         "[sensor]  # of the camera: shift in m and rotation in rad",
@@ -321,9 +378,10 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
 def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any], ask: bool) -> str:
     """`[log]` for the columns of a user's file, guessed where they are not given."""
     count = sum(given["tendons"])
-    guess = dict(zip(_COLUMNS, guess_columns([*table], count), strict=True))
+    n_markers = len(given["markers"])
+    guess = dict(zip(_COLUMNS, guess_columns([*table], count, n_markers), strict=True))
     names: dict[str, list[str]] = {}
-    for key, wanted in zip(_COLUMNS, (1, count, 3), strict=True):
+    for key, wanted in zip(_COLUMNS, (1, count, 3 * max(n_markers, 1)), strict=True):
         question = _Question(key, f"{key.replace('-', ' ')} of the log", ",".join(guess[key]), str)
         found = [word.strip() for word in _answer(question, arguments, ask).split(",") if word.strip()]
         if len(found) != wanted:
@@ -335,22 +393,35 @@ def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any]
     units = {}
     for question, key in zip(_FILE[:3], ("time-column", "tip-columns", "motor-columns"), strict=True):
         said = _UNIT.search(names[key][0])
-        unit = (
-            said[1].lower().replace("sec", "s") if said else _by_size(question.name, table, names[key], given)
-        )
+        unit = _spelt(said[1]) if said else _by_size(question.name, table, names[key], given)
         units[question.name] = _answer(question, arguments, ask, unit)
-    angular = units["motor-unit"] in UNITS["angle"]
+    angular, forces = units["motor-unit"] in UNITS["angle"], given["drive"] == "force"
+    if forces != (units["motor-unit"] in UNITS["force"]):
+        raise InputError(
+            f"--motor-unit is {units['motor-unit']!r}; with --drive {given['drive']} it is one of "
+            f"{', '.join(UNITS['force'] if forces else [*UNITS['length'], *UNITS['angle']])}."
+        )
     quoted = {key: ", ".join(f'"{name}"' for name in found) for key, found in names.items()}
+    kind = "tension" if forces else "dl"
+    places = [f"columns.tip = [{quoted['tip-columns']}]", f'units.tip = "{units["tip-unit"]}"']
+    if n_markers:
+        listed, seen = names["tip-columns"], [round(1e-3 * s, 7) for s in given["markers"]]
+        places = [f"columns.p{k + 1} = {listed[3 * k : 3 * k + 3]}" for k in range(n_markers)]
+        places += [f'units.points = "{units["tip-unit"]}"', f"points = {seen}  # arclengths, m"]
+        places += [
+            f"point_offsets = {[[round(1e-3 * x, 7), 0.0] for x in given['beside']]}  # along d1, d2, m"
+        ]
     lines = [
         "",
         "[log]  # your own log files",
         f"columns.t = {quoted['time-column']}",
-        f"columns.dl = [{quoted['motor-columns']}]  # in the order of the tendons above",
-        f"columns.tip = [{quoted['tip-columns']}]",
+        f"columns.{kind} = [{quoted['motor-columns']}]  # in the order of the tendons above",
         f'units.time = "{units["time-unit"]}"',
-        f'units.tip = "{units["tip-unit"]}"',
-        f'units.{"angle" if angular else "dl"} = "{units["motor-unit"]}"',
+        f'units.{"angle" if angular else "force" if forces else "dl"} = "{units["motor-unit"]}"',
+        *places,
     ]
+    if forces:
+        return "\n".join([*lines, ""])
     if angular:
         radii = _answer(_FILE[3], arguments, ask)
         lines.append(f"drum_radius = {1e-3 * radii[0]:.6g}  # m")
@@ -359,8 +430,17 @@ def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any]
     return "\n".join([*lines, ""])
 
 
-def guess_columns(names: Sequence[str], n_tendons: int) -> tuple[list[str], list[str], list[str]]:
-    """Time, motors and tip among the columns of a log, by their names; empty where none is like it.
+def _spelt(unit: str) -> str:
+    """A unit as it ends a column's name, as `UNITS` has it."""
+    every = {name.lower(): name for known in UNITS.values() for name in known}
+    return every[unit.lower().replace("sec", "s")]
+
+
+def guess_columns(
+    names: Sequence[str], n_tendons: int, n_markers: int = 0
+) -> tuple[list[str], list[str], list[str]]:
+    """Time, motors and tip, or markers, among the columns of a log, by their names; empty where none is like
+    it.
 
     >>> guess_columns(["stamp_ms", "m2_deg", "m1_deg", "cam_X", "cam_Y", "cam_Z"], 2)
     (['stamp_ms'], ['m1_deg', 'm2_deg'], ['cam_X', 'cam_Y', 'cam_Z'])
@@ -372,7 +452,9 @@ def guess_columns(names: Sequence[str], n_tendons: int) -> tuple[list[str], list
             triples.setdefault(f"{match[1]}|{match[3]}".lower(), {})[match[2].lower()] = name
     tips = [three for three in triples.values() if len(three) == 3]
     tips.sort(key=lambda three: not re.search(r"tip|marker|end|ee", three["x"].lower()))
-    tip = [tips[0][axis] for axis in "xyz"] if tips else []
+    if n_markers:  # base first, as they are numbered
+        tips.sort(key=lambda three: [int(d) for d in re.findall(r"\d+", three["x"])])
+    tip = [three[axis] for three in tips[: max(n_markers, 1)] for axis in "xyz"]
     alike: dict[str, list[str]] = {}
     for name in names:
         if name not in (*timed[:1], *tip):
@@ -381,7 +463,9 @@ def guess_columns(names: Sequence[str], n_tendons: int) -> tuple[list[str], list
             ).append(name)
     motors = [group for template, group in alike.items() if "#" in template and len(group) == n_tendons]
     motors.sort(
-        key=lambda group: not re.search(r"motor|servo|drive|tendon|dl|cmd|cable|wire", group[0].lower())
+        key=lambda group: (
+            not re.search(r"motor|servo|drive|tendon|tension|force|dl|cmd|cable|wire", group[0].lower())
+        )
     )
     first = (
         sorted(motors[0], key=lambda name: [int(d) for d in re.findall(r"\d+", name)] or [0])

@@ -198,6 +198,9 @@ class Law:
     reads_tension: ClassVar[bool] = False
     """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
     solve it together with the rod."""
+    on_forces: ClassVar[bool] = False
+    """Of ACTUATION: it acts on forces of tendons, where these are the commands, as it does on lengths. Any
+    other leaves such a robot's commands as they are."""
     reads_bend: ClassVar[bool] = False
     """It reads `ports.solved_bend`, what the rod makes of its tendons: with it the bend, not the command, has
     a memory. When it is of which state, as with `reads_tension`."""

@@ -113,18 +113,30 @@ def approached(force: Floats, target: Floats, slopes: Floats, by_force: Floats) 
     return np.asarray(force + np.linalg.solve(matrix, (target - force)[..., None])[..., 0])
 
 
+def acts_on_commands(what: Effect, routing: Routing) -> bool:
+    """Whether an effect may change what drives the tendons: not one of lengths, where forces do."""
+    return not (routing.by_tension and what.seam is Seam.ACTUATION and not bool(trait(what, "on_forces")))
+
+
 def act(links: Iterable[Link], opened: EffectPorts, state: Any = None, dt: float = 0.0) -> None:
     """Let the effects before the camera change `opened`, but for those that feel the tip (`tip_feedback`);
     memories move on by `dt` [s]. `state`: the last one of a simulator."""
     opened.state = state
     for each in links:
         if each.effect.seam is not Seam.SENSING and not feels_tip(each.effect):
+            commands, takes = opened.tendon_length, acts_on_commands(each.effect, opened.routing)
+            if not takes:
+                opened.tendon_length = np.broadcast_to(opened.rest_length, commands.shape).copy()
             each.effect.apply(each.values, each.memory, opened, state, dt)
+            if not takes:
+                opened.tendon_length = commands
 
 
 def sweep(one: Link, opened: EffectPorts, runs: Sequence[slice], dt: Floats) -> None:
     """Let an effect with a memory change the tendon lengths of `opened`, whose rows are the samples of
     `runs`, each from rest; `dt` (n,) is the time before each sample [s]."""
+    if not acts_on_commands(one.effect, opened.routing):
+        return
     rest, dl = opened.rest_length, opened.dl
     out = dl.copy()
     for span in runs:

@@ -12,6 +12,7 @@ from fastrod.effects import executor
 from fastrod.effects.base import canonical_name, effect_names, read_values
 from fastrod.effects.executor import Link, SensedPoses
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
+from fastrod.effects.ports import driven as driven_by
 from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
@@ -264,7 +265,8 @@ class EffectPipeline:
             given = {"tendon_length": driven, "tension": driven, "extension": extension}
             opened = self._open(ports._replace(**given), params, n_steps)
             executor.act(links, opened, state, 0.0 * dt)
-            driven = np.where(self._pulled, opened.tension, opened.tendon_length)
+            length, tension = driven_by(opened, ports._replace(**given))
+            driven = np.where(self._pulled, tension, length)
             return np.concatenate([driven, opened.extension], axis=1)
 
         n_tendons = self.routing.n_tendons
@@ -307,8 +309,8 @@ class EffectPipeline:
             n_steps=n_steps,
         )
         opened.solved_bend = self._bend.copy()
-        # these are not commanded: nothing to act on
-        opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
+        if not self.routing.by_tension:  # these are not commanded: nothing to act on
+            opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
         for given in (
             opened.tendon_length,
             opened.tension,

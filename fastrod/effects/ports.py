@@ -51,7 +51,8 @@ class EffectPorts:
     time: Floats
     """Read: (n,) since the start of the run [s]."""
     tendon_length: Floats
-    """(n, n_tendons) absolute [m]; change it through `shift_tendons`, `shift_bend`."""
+    """(n, n_tendons) absolute [m]; change it through `shift_tendons`, `shift_bend`. Where forces drive the
+    tendons, the rest length less the force [N]: see `Routing`."""
     extension: Floats
     """(n, n_segments) [m]."""
     offset: Floats
@@ -147,9 +148,13 @@ class EffectPorts:
         """Change tendon lengths by (n, n_tendons) [m], the part of it that bends.
 
         A change that all tendons of a segment share would be taken up by tendons and backbone; between stiff
-        tendons and an incompressible rod it would only be tension without bound.
+        tendons and an incompressible rod it would only be tension without bound. Of forces all is
+        taken.
         """
-        self.shift_bend(self.routing.bend(change))
+        if self.routing.by_tension:
+            self.tendon_length += change
+        else:
+            self.shift_bend(self.routing.bend(change))
 
     def move_base(self, shift: Floats, rotation: Floats) -> None:
         """Move the base by (n, 3) [m] and about itself by rotation vectors (n, 3) [rad], both world: a mount
@@ -233,13 +238,14 @@ def open_ports(
     stateless: bool = False,
 ) -> EffectPorts:
     """The ports of a step with a row for each of `n` robots, ready to be changed."""
+    length = rest_length - ports.tension if routing.by_tension else ports.tendon_length
     return EffectPorts(
         routing=routing,
         rest_length=rest_length,
         gravity=np.broadcast_to(gravity, (n, 3)),
         base_rotation=np.broadcast_to(base_rotation, (n, 3, 3)),
         time=np.broadcast_to(time, (n,)),
-        tendon_length=_rows(ports.tendon_length, n),
+        tendon_length=_rows(length, n),
         extension=_rows(ports.extension, n),
         offset=_rows(params.offset, n),
         compliance=_rows(params.compliance, n),
@@ -257,6 +263,15 @@ def open_ports(
     )
 
 
+def driven(opened: EffectPorts, ports: Ports) -> tuple[Floats, Floats]:
+    """Tendon lengths [m] and tensions [N] that the kernel reads, of ports that effects have changed."""
+    if not opened.routing.by_tension:
+        return opened.tendon_length, opened.tension
+    # 0, and no rounding, where no effect has changed anything
+    change = (opened.rest_length - ports.tension) - opened.tendon_length
+    return ports.tendon_length, opened.tension + change
+
+
 def close_ports(
     opened: EffectPorts, ports: Ports, params: Params
 ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
@@ -266,10 +281,11 @@ def close_ports(
     if opened.rest_bend.any():
         precurvature = precurvature.copy()
         precurvature[..., :2] += (opened.rest_bend / opened.routing.length[:, None])[:, :, None]
+    length, tension = driven(opened, ports)
     return (
         ports._replace(
-            tendon_length=opened.tendon_length,
-            tension=opened.tension,
+            tendon_length=length,
+            tension=tension,
             base_pose=opened.base_pose,
             extension=opened.extension,
             stiffness=np.ascontiguousarray(opened.stiffness),

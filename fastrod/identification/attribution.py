@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from fastrod.effects.base import effect_names, get_effect
+from fastrod.effects.executor import acts_on_commands, feels_tip
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
@@ -35,6 +37,7 @@ from fastrod.identification.search.structure import are_pulled, are_worth_trying
 from fastrod.loading import robot_of
 from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot
+from fastrod.model.routing import route
 from fastrod.solver.motion import solver_of
 from fastrod.threads import one_blas_thread
 
@@ -103,6 +106,7 @@ def identify(
     given = [logs] if isinstance(logs, (RunLog, str, Path)) or not isinstance(logs, Sequence) else logs
     every = [log_of(one, robot) for one in given]
     log = split(every, robot, held_out)
+    excluded = frozenset(exclude) | _not_of(robot, log.samples.log.without_tip)
     # refuses a wrong [fit] before anything is solved
     model = base_model(
         robot,
@@ -111,9 +115,7 @@ def identify(
         sessions=log.samples.sessions if dynamics else ("",),
     )
     if dynamics:
-        return _in_motion(
-            log, robot, model, free_camera, frozenset(exclude), max_effects, progressed, threads
-        )
+        return _in_motion(log, robot, model, free_camera, excluded, max_effects, progressed, threads)
     if max_effects and (found := _rings(log, robot, progressed, threads)):
         return found
     progressed("registration", 0, most)
@@ -137,10 +139,10 @@ def identify(
         )
 
     progressed("base fit", 0, most)
-    base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads)
+    base = fit_base(some, log.rows, model_of(robot), robot, excluded, threads)
     if base.left < _FAR * base.noise.floor and solver_of([robot], None, False) == "observer":
         some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
-        base = fit_base(some, log.rows, model_of(robot), robot, frozenset(exclude), threads, base)
+        base = fit_base(some, log.rows, model_of(robot), robot, excluded, threads, base)
     progressed(base.sentence, 0, most)
 
     log, base, outcome = _found(log, base, reading.guess, max_effects, model_of, progressed, threads)
@@ -160,6 +162,14 @@ def identify(
         if network
         else result
     )
+
+
+def _not_of(robot: Robot, without_tip: bool) -> frozenset[str]:
+    """Effects that are none of such a robot: of tendon lengths where forces drive the tendons, and of a tip
+    that was not measured."""
+    lengths = {name for name in effect_names() if not acts_on_commands(get_effect(name), route(robot))}
+    tip = {"marker_offset", *(name for name in effect_names() if feels_tip(get_effect(name)))}
+    return frozenset(lengths | (tip if without_tip else set()))
 
 
 def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:

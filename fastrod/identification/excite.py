@@ -16,7 +16,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing, route
+from fastrod.model.routing import route
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -105,9 +105,11 @@ def excitation(
         phases.append(MotionPhase(name, start, start + len(what) / rate, purpose))
 
     def still(seconds: float) -> Floats:
-        return np.zeros((round(seconds * rate), wiring.n_segments, 2))
+        return np.zeros((round(seconds * rate), n_sections, 2))
 
-    blocks = [_block(wiring, bend, rate, speed, number, rng) for number in range(4)]
+    each = wiring.of_sections(wiring.bend(np.eye(robot.n_tendons)))  # of a pull of each tendon alone
+    n_sections = each.shape[1]
+    blocks = [_block(n_sections, bend, rate, speed, number, rng) for number in range(4)]
     add("rest", still(REST), "noise of the camera, zero of the drives")
     turned, loaded = [np.zeros(len(rows[0]), bool)], [np.zeros(len(rows[0]), bool)]
     for number, (pieces, other, load) in enumerate(
@@ -135,6 +137,7 @@ def excitation(
     )
     add("return", _line(first[-1], np.zeros_like(first[-1]), bend, rate, speed), "back to rest")
     path = np.concatenate(rows)
+    pulls: Floats = path.reshape(len(path), -1) @ np.linalg.pinv(each.reshape(robot.n_tendons, -1))
     rest = len(path) - sum(len(a) for a in turned)
     turned.append(np.zeros(rest, bool))
     loaded.append(np.zeros(rest, bool))
@@ -148,7 +151,8 @@ def excitation(
         name=f"{robot.name}_excitation",
         t=np.arange(len(path)) / rate,
         run=np.full(len(path), ""),
-        dl=np.round(wiring.tendon_change(path), 9),
+        dl=np.zeros_like(pulls) if robot.by_tension else np.round(pulls, 9),
+        tension=np.round(_pulling(-pulls, robot), 6) if robot.by_tension else None,
         tip_position=np.full((len(path), 3), np.nan),
         payload=np.where(np.concatenate(loaded), payload, 0.0),
         base_quaternion=np.where(np.concatenate(turned)[:, None], tilted, own),
@@ -156,12 +160,22 @@ def excitation(
     return Excitation(log, tuple(phases))
 
 
+def _pulling(force: Floats, robot: Robot) -> Floats:
+    """Forces (n, n_tendons) that bend alike [N], with none below 0 on tendons that only pull: those of a
+    segment have a force in common."""
+    made, ends = force.copy(), np.asarray(robot.tendon_segment)
+    for end in np.unique(ends):
+        own = ends == end
+        if any(t.unilateral for t, mine in zip(robot.tendons, own, strict=True) if mine):
+            made[:, own] -= made[:, own].min(axis=1, keepdims=True)
+    return made
+
+
 def _block(
-    wiring: Routing, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator
+    n: int, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator
 ) -> list[tuple[str, Floats, str]]:
     """Pieces of one block, each (name, (n, n_segments, 2) bends [rad], purpose), from straight to
     straight."""
-    n = wiring.n_segments
     zero = np.zeros((n, 2))
     pieces: list[tuple[str, Floats, str]] = []
     for k in range(n):

@@ -28,6 +28,7 @@ _LONGEST_MOVE = 3.0  # robot lengths; nothing on the robot moves further, so the
 _FAR = 30.0  # robot lengths; no camera that sees the robot is further off
 _COUNTED_FROM = 0.25  # of the robot's length, by all tendons alike: no robot is pulled or paid out so far
 _LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
+_PUSHED = 0.05  # of the largest force; a load cell has a zero
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -47,9 +48,13 @@ class RunLog:
     """(n,) label of the run that the sample belongs to; '' where the log names none."""
     dl: Floats
     """(n, n_tendons) change of each tendon's length against the straight rest robot [m], negative =
-    pulled."""
+    pulled; 0 of tendons that are driven by force."""
     tip_position: Floats
-    """(n, 3) measured tip, base frame [m]."""
+    """(n, 3) measured tip, base frame [m]; of a log `without_tip` the last of the robot's `log_points`."""
+    tension: Floats | None = None
+    """(n, n_tendons) force on each tendon, of a robot that is driven by forces [N]."""
+    without_tip: bool = False
+    """No tip was measured: the last of the robot's `log_points` stands for it; `points` are the others."""
     pos: Floats | None = None
     """(n, n_tendons) measured positions of the drives, counted as `dl` [m]: what moved the tendons, where
     `dl` was asked for."""
@@ -78,6 +83,7 @@ class RunLog:
             "run": (n,),
             "dl": (n, None),
             "pos": np.shape(self.dl),
+            "tension": np.shape(self.dl),
             "session": (n,),
             "tip_position": (n, 3),
             "ext": (n, None),
@@ -110,13 +116,29 @@ class RunLog:
         return list(dict.fromkeys(self.run.tolist()))
 
     @property
+    def commands(self) -> Floats:
+        """(n, n_tendons) what drives the tendons: `dl` [m], or `tension` [N]."""
+        return self.dl if self.tension is None else self.tension
+
+    @property
+    def pulls(self) -> Floats:
+        """(n, n_tendons) the same, negative = pulled: lengths [m], or forces [N]."""
+        return self.dl if self.tension is None else -self.tension
+
+    def with_pulls(self, pulls: Floats) -> RunLog:
+        """The log with other `pulls`."""
+        return replace(self, dl=pulls) if self.tension is None else replace(self, tension=-pulls)
+
+    @property
+    def inputs(self) -> Floats:
+        """(n, n_inputs) all that is given: commands, extension, known loads, base orientation."""
+        given = (self.commands, self.ext, self.tip_force, self.payload, self.base_quaternion)
+        return np.concatenate([a.reshape(len(self), -1) for a in given if a is not None], axis=1)
+
+    @property
     def driven(self) -> NDArray[np.bool_]:
-        """(n,) rows whose inputs are all there: actuation, known loads, base orientation."""
-        rows = np.isfinite(self.dl).all(axis=1)
-        for value in (self.ext, self.tip_force, self.payload, self.base_quaternion):
-            if value is not None:
-                rows &= np.isfinite(value.reshape(len(self), -1)).all(axis=1)
-        return np.asarray(rows, dtype=np.bool_)
+        """(n,) rows whose inputs are all there."""
+        return np.asarray(np.isfinite(self.inputs).all(axis=1), dtype=np.bool_)
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -131,7 +153,7 @@ class RunLog:
         cut = {
             f.name: value[index]
             for f in fields(self)
-            if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
+            if f.name not in ("name", "extra", "without_tip") and (value := getattr(self, f.name)) is not None
         }
         extra = {key: _taken(value, index) for key, value in self.extra.items()}
         return replace(self, extra=extra, **cut)
@@ -174,23 +196,36 @@ def read_log(path: str | Path, robot: Robot | str | Path) -> RunLog:
         known.update(names)
         return np.stack([numbers(table, name, where) for name in names], axis=1)
 
-    _need(table, ("t", *_TIP), where, "that every run log has")
+    points = _points(table, robot, where, group)
+    without_tip = points is not None and points.shape[1] > 0 and not set(_TIP) & set(table)
+    _need(table, ("t",) if without_tip else ("t", *_TIP), where, "that every run log has")
     t, tip = group(("t",)), group(_TIP)
     assert t is not None
+    if without_tip and points is not None:
+        points, tip = points[:, :-1], points[:, -1]
     assert tip is not None
-    dl, pos = (_of_tendons(table, kind, robot, where, group) for kind in ("dl", "pos"))
+    forces = any(re.fullmatch(r"tension_\d+", name) for name in table)
+    if forces and not any(re.fullmatch(r"dl_\d+", name) for name in table) and not robot.by_tension:
+        raise LogError(
+            f"{where} gives tendon forces, tension_1 and so on, and robot {robot.name!r} is driven by "
+            'lengths; give its segments mode = "tendon_tension".'
+        )
+    dl = _of_tendons(table, "tension" if robot.by_tension else "dl", robot, where, group)
+    pos = _of_tendons(table, "pos", robot, where, group)
     payload = group(("payload",))
     log = RunLog(
         name=path.stem,
         t=t[:, 0],
         run=_labels(table, n, "run"),
-        dl=np.zeros((n, 0)) if dl is None else dl,
+        dl=np.zeros((n, robot.n_tendons)) if dl is None or robot.by_tension else dl,
         tip_position=tip,
+        tension=dl if robot.by_tension else None,
+        without_tip=without_tip,
         pos=pos,
         session=_labels(table, n, "session") if "session" in table else None,
         ext=_extension(table, robot, where, known),
         tip_quaternion=_unit(group(_TIP_QUATERNION), _TIP_QUATERNION, where),
-        points=_points(table, robot, where, group),
+        points=points,
         tip_force=group(_TIP_FORCE),
         payload=None if payload is None else payload[:, 0],
         base_quaternion=_unit(group(_BASE_QUATERNION), _BASE_QUATERNION, where),
@@ -217,7 +252,7 @@ def on_one_clock(log: RunLog, clock: float) -> RunLog:
     t + `clock` [s]. Rows for which no command is known miss it."""
     if not clock:
         return log
-    names = [name for name in ("dl", "pos", "ext") if getattr(log, name) is not None]
+    names = [name for name in ("dl", "tension", "pos", "ext") if getattr(log, name) is not None]
     made = {name: getattr(log, name).copy() for name in names}
     for label in log.runs:
         own = (log.run == label) & np.isfinite(log.t)
@@ -283,11 +318,13 @@ def _of_tendons(
     table: Table, kind: str, robot: Robot, where: str, group: Callable[[Sequence[str]], Floats | None]
 ) -> Floats | None:
     """(n, n_tendons) the columns of each tendon of a `kind`, "dl", which a log must have, or "pos"."""
-    if kind != "dl" and not any(re.fullmatch(rf"{kind}_\d+", name) for name in table):
+    if kind == "pos" and not any(re.fullmatch(rf"{kind}_\d+", name) for name in table):
         return None
     names, by_drive = _tendon_columns(table, kind, robot, where)
     values = group(names)
-    return values if values is None or by_drive is None else values @ by_drive
+    if values is None or by_drive is None:
+        return values
+    return values @ by_drive if kind != "tension" else np.maximum(values @ by_drive, 0.0)
 
 
 def _tendon_columns(table: Table, kind: str, robot: Robot, where: str) -> tuple[list[str], Floats | None]:
@@ -414,6 +451,12 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
             far,
         )
     _check_changes(log, robot, where)
+    if log.tension is not None:
+        pushed = -log.tension.min(axis=1) if robot.n_tendons else np.zeros(len(log))
+        most = float(np.nanmax(np.abs(log.tension), initial=0.0))
+        why = "a tendon does not push. Give positive forces [N]."
+        if all(tendon.unilateral for tendon in robot.tendons):
+            refuse(pushed > _PUSHED * most, "the least of columns tension_", -pushed, "N", why)
     for kind, values in (("dl", log.dl), ("pos", log.pos)):
         for k in range(log.dl.shape[1] if values is not None else 0):
             assert values is not None
@@ -476,12 +519,17 @@ def _columns(log: RunLog) -> Table:
     if log.session is not None:
         columns["session"] = log.session.tolist()
     points = np.zeros((len(log), 0, 3)) if log.points is None else log.points
+    if log.without_tip:
+        points = np.concatenate([points, log.tip_position[:, None]], axis=1)
     point_names = [f"p{k}_{axis}" for k in range(1, points.shape[1] + 1) for axis in "xyz"]
     groups: list[tuple[Sequence[str], Floats | None]] = [
-        ([f"dl_{k}" for k in range(1, log.dl.shape[1] + 1)], log.dl),
+        (
+            [f"{'dl' if log.tension is None else 'tension'}_{k}" for k in range(1, log.dl.shape[1] + 1)],
+            log.commands,
+        ),
         ([f"pos_{k}" for k in range(1, log.dl.shape[1] + 1)], log.pos),
         ([f"ext_{k}" for k in range(1, 1 + (0 if log.ext is None else log.ext.shape[1]))], log.ext),
-        (_TIP, log.tip_position),
+        (_TIP, None if log.without_tip else log.tip_position),
         (_TIP_QUATERNION, log.tip_quaternion),
         (point_names, points.reshape(len(log), len(point_names))),
         (_TIP_FORCE, log.tip_force),

@@ -81,6 +81,14 @@ def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -
     return value
 
 
+def _mean_power(ends: tuple[float, ...], power: int) -> float:
+    """Mean of radius^power along a cone between the radii `ends`."""
+    a, b = ends[0], ends[-1]
+    if math.isclose(a, b, rel_tol=1e-6):
+        return float((0.5 * (a + b)) ** power)
+    return float((b ** (power + 1) - a ** (power + 1)) / ((power + 1) * (b - a)))
+
+
 @_named_fields
 @dataclass(frozen=True, kw_only=True)
 class Tendon:
@@ -200,7 +208,7 @@ class Segment:
         cls,
         *,
         length: float,
-        radius: float,
+        radius: float | tuple[float, float],
         youngs_modulus: float,
         density: float = 0.0,
         poisson: float = 0.3,
@@ -209,13 +217,18 @@ class Segment:
         """Round segment of one material: stiffness, mass and body from its radius [m], Young's modulus [Pa],
         density [kg/m^3] and Poisson's ratio.
 
-        It stretches and shears (shear coefficient of a circle by Cowper 1966); `more` are other fields, such
-        as tendons. Raises `RobotError` for numbers that no material has.
+        Two radii are those of the ends of a short piece that tapers: the segment is as soft and as heavy as
+        that on the average. It stretches and shears (shear coefficient of a circle by Cowper 1966); `more`
+        are other fields, such as tendons. Raises `RobotError` for numbers that no material has.
 
         >>> Segment.from_material(length=0.1, radius=1e-3, youngs_modulus=60e9, mode="passive").line_density
         0.0
         """
-        for name, value, unit in (("radius", radius, "m"), ("youngs_modulus", youngs_modulus, "Pa")):
+        ends = tuple(radius) if isinstance(radius, (tuple, list)) else (radius,)
+        for name, value, unit in (
+            *(("radius", r, "m") for r in ends),
+            ("youngs_modulus", youngs_modulus, "Pa"),
+        ):
             if not _number(value):
                 raise RobotError(f"{name} is {value!r}; it must be a number [{unit}].")
             _positive(name, value, unit)
@@ -223,7 +236,8 @@ class Segment:
             raise RobotError(f"density is {density!r} kg/m^3; it must be zero or positive.")
         if not _number(poisson) or not -1.0 < poisson <= 0.5:
             raise RobotError(f"poisson is {poisson!r}; Poisson's ratio is above -1, and 0.5 at most.")
-        area, second_moment = math.pi * radius**2, 0.25 * math.pi * radius**4
+        # forces and moments are the same along a short piece: what is averaged is how it gives to them
+        area, second_moment = math.pi / _mean_power(ends, -2), 0.25 * math.pi / _mean_power(ends, -4)
         shear_modulus = 0.5 * youngs_modulus / (1.0 + poisson)
         given: dict[str, Any] = {
             "length": length,
@@ -231,8 +245,10 @@ class Segment:
             "torsional_stiffness": 2.0 * shear_modulus * second_moment,
             "axial_stiffness": youngs_modulus * area,
             "shear_stiffness": shear_modulus * area * 6.0 * (1.0 + poisson) / (7.0 + 6.0 * poisson),
-            "line_density": density * area,
-            "body_radius": max([radius, *(float(np.max(t.offset)) for t in more.get("tendons", ()))]),
+            "line_density": density * math.pi * _mean_power(ends, 2),
+            "body_radius": max(
+                [sum(ends) / len(ends), *(float(np.max(t.offset)) for t in more.get("tendons", ()))]
+            ),
         }
         return cls(**(given | more))
 
@@ -320,6 +336,9 @@ class Robot:
     the usual. A host in whose world it is another refuses it."""
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
+    log_offsets: tuple[tuple[float, float], ...] = ()
+    """Where these lie beside the backbone, along d1 and d2 of the cross-section there [m]; left out: on
+    it."""
     log: LogFormat = field(default_factory=LogFormat)
     """Columns, units and signs of this robot's own log files (contracts: `[log]`)."""
     effects: tuple[Mapping[str, Any], ...] = ()
@@ -375,6 +394,13 @@ class Robot:
                 f"[log] points is {list(self.log_points)!r}; each must be an arclength between "
                 f"0 and {total:g} m."
             )
+        if self.log_offsets and len(self.log_offsets) != len(self.log_points):
+            raise RobotError(
+                f"[log] point_offsets lists {len(self.log_offsets)} pairs and points {len(self.log_points)} "
+                "arclengths; give each point one pair [m]."
+            )
+        for pair in self.log_offsets:
+            _finite("[log] point_offsets", tuple(pair), 2, "m")
 
     def _check_sensor(self) -> None:
         for key, value in self.sensor.items():
@@ -413,6 +439,11 @@ class Robot:
         return np.array(
             [k for k, segment in enumerate(self.segments) for _ in segment.tendons], dtype=np.int64
         )
+
+    @property
+    def by_tension(self) -> bool:
+        """Whether all tendons are driven by force, those of segments in mode `tendon_tension`."""
+        return self.n_tendons > 0 and all(s.mode == "tendon_tension" for s in self.segments if s.tendons)
 
     @property
     def length(self) -> float:

@@ -17,10 +17,12 @@ import tomli_w
 from fastrod.errors import RobotError, UnknownNameError, nearest, shown
 from fastrod.model.logformat import LogFormat
 from fastrod.model.robot import MODES, Lump, Robot, Segment, Tendon
+from fastrod.model.taper import in_pieces
 from fastrod.tomlfile import parse, read_text
 
 _LOG = tuple(f.name for f in fields(LogFormat))
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
+_MATERIAL = ("youngs_modulus", "poisson", "density")
 _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
 
 
@@ -68,14 +70,15 @@ def loads(text: str, where: str = "robot file") -> Robot:
         raise RobotError(f"{where}: segment is one table; write [[segment]], in double brackets.")
     base = _section(data, "base", ("position", "quaternion"), where)
     world = _section(data, "world", ("gravity",), where)
-    log = _section(data, "log", ("points", *_LOG), where)
-    points = log.pop("points", None)
+    log = _section(data, "log", ("points", "point_offsets", *_LOG), where)
+    points, offsets = log.pop("points", None), log.pop("point_offsets", None)
     optional = {
         "base_position": base.get("position"),
         "base_quaternion": base.get("quaternion"),
         "gravity": world.get("gravity"),
         "states_gravity": True if "gravity" in world else None,
         "log_points": points,
+        "log_offsets": offsets,
         "log": log or None,
         "effects": data.get("effect"),
         "fit": data.get("fit"),
@@ -86,7 +89,10 @@ def loads(text: str, where: str = "robot file") -> Robot:
     try:
         return Robot(
             name=msgspec.convert(data["name"], str),
-            segments=tuple(_segment(table, f"{where}: segment {k}") for k, table in enumerate(segments, 1)),
+            segments=tuple(
+                _segment(table, f"{where}: segment {k}")
+                for k, table in enumerate(in_pieces(segments, where), 1)
+            ),
             **{key: _convert(value, key, where) for key, value in optional.items() if value is not None},
         )
     except msgspec.ValidationError as error:
@@ -104,7 +110,9 @@ def dumps(robot: Robot) -> str:
         data["world"] = {"gravity": list(robot.gravity)}
     if robot.effects:
         data["effect"] = [dict(effect) for effect in robot.effects]
-    log = {"points": list(robot.log_points)} if robot.log_points else {}
+    log: dict[str, Any] = {"points": list(robot.log_points)} if robot.log_points else {}
+    if robot.log_offsets:
+        log["point_offsets"] = [list(pair) for pair in robot.log_offsets]
     default = LogFormat()
     own = {key: getattr(robot.log, key) for key in _LOG if getattr(robot.log, key) != getattr(default, key)}
     if log | own:
@@ -135,10 +143,14 @@ def save_robot(robot: Robot, path: str | Path) -> None:
 
 def _segment(table: Any, where: str) -> Segment:
     known = [f.name for f in fields(Segment)]
-    _check_keys(table, (*known, *_MODULI), where)
+    _check_keys(table, (*known, *_MODULI, *_MATERIAL), where)
     table = dict(table)
     given = [key for key in _MODULI if key in table]
-    if given:
+    if given == ["youngs_modulus"] and "bending_stiffness" not in table and "body_radius" in table:
+        table = _of_material(table, where)
+    elif odd := [key for key in _MATERIAL[1:] if key in table]:
+        raise RobotError(f"{where} has {odd[0]}, which goes with youngs_modulus and body_radius alone.")
+    elif given:
         stiff = [key for key in ("bending_stiffness", "torsional_stiffness") if key in table]
         missing = [key for key in _MODULI if key not in table]
         if stiff or missing:
@@ -169,6 +181,17 @@ def _segment(table: Any, where: str) -> Segment:
         return msgspec.convert(table, Segment)
     except msgspec.ValidationError as error:
         raise RobotError(f"{where}: {_plain(error)}") from error
+
+
+def _of_material(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """The table of a round segment of one material with its stiffness and mass, as `Segment.from_material`;
+    what it says itself stands."""
+    _check_needed(table, ("length",), where)
+    moduli = {key: table.pop(key) for key in _MATERIAL if key in table}
+    radius = table.pop("body_radius")
+    made = Segment.from_material(length=table["length"], radius=radius, mode="passive", **moduli)
+    found = ("bending_stiffness", "torsional_stiffness", "axial_stiffness", "shear_stiffness", "line_density")
+    return {**{key: getattr(made, key) for key in found}, "body_radius": made.body_radius, **table}
 
 
 def _written(segment: Segment) -> dict[str, Any]:
@@ -211,6 +234,7 @@ _TYPES: dict[str, Any] = {
     "gravity": tuple[float, float, float],
     "states_gravity": bool,
     "log_points": tuple[float, ...],
+    "log_offsets": tuple[tuple[float, float], ...],
     "log": LogFormat,
     "fit": dict[str, dict[str, float | bool]],
     "sensor": dict[str, float | tuple[float, ...]],

@@ -1,4 +1,5 @@
-"""Tendons and bends: the linear map between the bend of the segments and the lengths of the tendons."""
+"""Tendons and bends: the linear map between the bend of the segments and what drives the tendons, their
+lengths or the forces on them."""
 
 from __future__ import annotations
 
@@ -12,7 +13,11 @@ from fastrod.types import Floats, Ints
 
 @dataclass(frozen=True)
 class Routing:
-    """Routing of one robot's tendons; the same for every robot of a batch."""
+    """Routing of one robot's tendons; the same for every robot of a batch.
+
+    Of a robot whose tendons are driven by force, "tendon length" is here the force, negative = pulled as a
+    length is [N]: an effect of the drives, such as latency, then acts on either.
+    """
 
     n_segments: int
     tendon_segment: Ints
@@ -30,6 +35,8 @@ class Routing:
     """(n_tendons,) distance of the tendon from the backbone in its last segment [m]."""
     length: Floats
     """(n_segments,) of the robot [m]."""
+    by_tension: bool = False
+    """Whether forces drive the tendons."""
 
     @property
     def n_tendons(self) -> int:
@@ -58,6 +65,12 @@ class Routing:
         for."""
         return _times(dl, self.bend_from_tendons.T).reshape(*dl.shape[:-1], self.n_segments, 2)
 
+    def of_sections(self, bend: Floats) -> Floats:
+        """(..., n_sections, 2) bend of what lies between two ends of tendons [rad], from (..., n_segments,
+        2): a segment that tapers is a chain of pieces."""
+        ends = np.unique(self.tendon_segment)
+        return np.diff(np.cumsum(bend, axis=-2)[..., ends, :], axis=-2, prepend=0.0)
+
     def tendon_change(self, bend: Floats) -> Floats:
         """(..., n_tendons) change of tendon length [m] that goes with a bend (..., n_segments, 2) [rad]."""
         return _times(bend.reshape(*bend.shape[:-2], 2 * self.n_segments), self.arms.T)
@@ -74,7 +87,7 @@ def _times(a: Floats, matrix: Floats) -> Floats:
 
 def route(robot: Robot) -> Routing:
     """The routing of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each
-    segment."""
+    segment. Where forces drive the tendons: the bend l M / EI of a straight rod under their moments."""
     ends = robot.tendon_segment
     positions = [tendon.position(int(end) + 1) for tendon, end in zip(robot.tendons, ends, strict=True)]
     arms = np.zeros((robot.n_tendons, 2 * robot.n_segments))
@@ -97,15 +110,19 @@ def route(robot: Robot) -> Routing:
                 drive[other], sign[other] = count, -1.0
                 break
         count += 1
+    inverse = np.asarray(np.linalg.pinv(arms), dtype=np.float64) if robot.n_tendons else arms.T.copy()
+    if robot.by_tension:
+        softness = np.array([np.divide(s.length, s.bending_stiffness) for s in robot.segments]).ravel()
+        inverse = softness[:, None] * arms.T
+        arms = np.asarray(np.linalg.pinv(inverse), dtype=np.float64)
     return Routing(
         n_segments=robot.n_segments,
         tendon_segment=ends,
         arms=arms,
-        bend_from_tendons=np.asarray(np.linalg.pinv(arms), dtype=np.float64)
-        if robot.n_tendons
-        else arms.T.copy(),
+        bend_from_tendons=inverse,
         drive=drive.astype(np.int64),
         drive_sign=sign,
         tendon_offset=np.array([float(np.hypot(*places[-1])) for places in positions]),
         length=np.array([segment.length for segment in robot.segments]),
+        by_tension=robot.by_tension,
     )

@@ -46,7 +46,7 @@ Rows = list[tuple[Callable[[], object], str]]
 INPUTS: Rows = [
     (
         lambda: replay(runs_of(), rod("tendon_tension")),
-        "mode 'tendon_tension', but a run log gives tendon lengths",
+        "is driven by tendon forces, and log .* gives lengths; mode of its segments would be 'tendon_length'",
     ),
     (lambda: excitation(rod("passive")), "robot 'passive' has no tendons; there is nothing to excite"),
     (lambda: excited(bend=0.0), "bend is 0.0 rad; it must be positive"),

@@ -24,6 +24,7 @@ class DrumGain(Static):
     parameters = (Parameter("gain", "", bounds=(-0.8, 4.0), typical=0.03, per="drive"),)
     excited_by = "bends of many amplitudes in every direction"
     confounded_with = ("tendon_stretch", "stiffness_taper", "stiffening")
+    on_forces = True
     synonyms = ("spool_radius", "actuation_gain")
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:

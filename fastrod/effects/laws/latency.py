@@ -29,6 +29,7 @@ class Latency(Operator):
     parameters = (Parameter("delay", "s", bounds=(0.0, 1.0), typical=0.1, starts=(0.06, 0.15)),)
     excited_by = "motion at two speeds, with stops"
     confounded_with = ("second_order_lag", "creep")
+    on_forces = True
     synonyms = ("delay", "time_delay")
     separated_by: ClassVar[Mapping[str, str]] = {
         "second_order_lag": "fast and slow motion with sudden stops, beyond 50 degrees: a delay rings not",

@@ -32,6 +32,7 @@ class SecondOrderLag(Operator):
         ),
     )
     excited_by = "steps and fast reversals, sampled at ten times the frequency"
+    on_forces = True
     confounded_with = ("latency", "creep")
     signal = Signal.MOTION
 

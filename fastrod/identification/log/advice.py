@@ -37,8 +37,10 @@ def loaded(samples: LogSamples, robot: Robot) -> bool:
     weight = any(segment.line_density > 0.0 for segment in robot.segments) and bool(
         np.any(np.array(robot.gravity) != 0.0)
     )
-    return weight or any(
-        a is not None and bool(np.any(np.nan_to_num(a) != 0.0)) for a in (log.tip_force, log.payload)
+    return (
+        weight
+        or log.tension is not None
+        or any(a is not None and bool(np.any(np.nan_to_num(a) != 0.0)) for a in (log.tip_force, log.payload))
     )
 
 
@@ -85,7 +87,7 @@ def excitation(samples: LogSamples, bend: Floats) -> list[tuple[bool, str, str]]
             "registration or precurvature",
         ),
         (
-            log.payload is not None or log.tip_force is not None,
+            log.payload is not None or log.tip_force is not None or log.tension is not None,
             "known loads: stretch of the tendons apart from the gain of the drives, and stiffness",
             "no known load: stretch of the tendons cannot be distinguished from the gain of the drives, "
             "stiffness is not seen",

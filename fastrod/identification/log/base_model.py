@@ -14,7 +14,15 @@ import numpy as np
 from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import RobotError, nearest
-from fastrod.identification.log.unknowns import ADDED, SEGMENT_UNITS, TENDON_UNITS, Model, Unknown, nominal_of
+from fastrod.identification.log.unknowns import (
+    ADDED,
+    MATERIAL,
+    SEGMENT_UNITS,
+    TENDON_UNITS,
+    Model,
+    Unknown,
+    nominal_of,
+)
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 
@@ -69,7 +77,8 @@ def base_model(
                 "(dynamics=True)."
             )
     for kind in ("bending_stiffness", "torsional_stiffness"):
-        if not any(u.place[:2] == ("robot", kind) for u in unknowns):
+        known = (("robot", kind), ("robot", "material"))
+        if not any(u.place[:2] in known and u.name != "material.density" for u in unknowns):
             name = f"segment.*.{kind}"
             numbers = tuple(str(k) for k in range(robot.n_segments))
             unknowns.append(
@@ -120,12 +129,20 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
     match = re.fullmatch(r"(segment|tendon)\.(\*|\d+)\.(\w+)", target)
     kinds = {"segment": SEGMENT_UNITS, "tendon": TENDON_UNITS}
     names = [f"{word}.*.{kind}" for word, table in kinds.items() for kind in table]
+    names += [f"material.{kind}" for kind in MATERIAL]
     if lump := re.fullmatch(r"segment\.(\d+)\.lump\.(\d+)\.mass", target):
         return [
             _lump_unknown(
                 robot, target, (int(lump[1]) - 1, int(lump[2]) - 1), _checked_sd(robot, target, prior)
             )
         ]
+    word, _, kind = target.partition(".")
+    if word == "material" and kind in MATERIAL:
+        sd, place = _checked_sd(robot, target, prior), ("robot", "material", kind)
+        if kind == "taper":
+            return [Unknown(target, "", 0.0, 0.0, sd, (-0.6, 0.6), min(0.02, 0.3 * sd), place)]
+        step = min(0.05, 0.3 * sd)
+        return [Unknown(target, "x nominal", 1.0, 1.0, sd, (0.02, 50.0), step, place, log=True)]
     if match is None or match[3] not in kinds[match[1]]:
         raise RobotError(f"robot {robot.name!r}: [fit] {target!r} is no parameter; {nearest(target, names)}")
     word, number, kind = match[1], match[2], match[3]

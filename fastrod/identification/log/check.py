@@ -74,7 +74,8 @@ def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int |
         columns, found, least = _matched(samples, robot, threads)
         if columns is not None and not least < left:
             columns, found = None, robot
-    bend = route(robot).bend(np.asarray(samples.log.dl))
+    wiring = route(robot)
+    bend = wiring.of_sections(wiring.bend(samples.log.pulls))
     said = excitation(samples, bend)
     return LogCheck(
         facts=_facts(samples, robot, bend, left),
@@ -98,8 +99,8 @@ def _matched(
         columns = column_order(samples, robot, sign)
         if columns is not None:
             rotated = _rotated(robot, columns.rotation)
-            dl = columns.of(np.asarray(samples.log.dl))
-            left = left_by(replace(samples, log=replace(samples.log, dl=dl)), rotated, threads)
+            log = samples.log.with_pulls(columns.of(samples.log.pulls))
+            left = left_by(replace(samples, log=log), rotated, threads)
             as_filed = sign == 0.0 and len(set(columns.sign.tolist())) == 1
             found.append((left * (_BETTER if as_filed else 1.0), left, columns, rotated))
     if not found:
@@ -130,21 +131,22 @@ def _rotated(robot: Robot, rotation: Floats) -> Robot:
 def _with_columns(robot: Robot, columns: ColumnOrder) -> Robot:
     """The robot with `[log]` for its columns in the order and with the signs that were found."""
     log, n = robot.log, robot.n_tendons
-    names = [log.sources.get(f"dl_{k}", f"dl_{k}") for k in range(1, n + 1)]
+    kind = "tension" if robot.by_tension else "dl"
+    names = [log.sources.get(f"{kind}_{k}", f"{kind}_{k}") for k in range(1, n + 1)]
 
     def each(value: object) -> list[float]:
         given = list(value) if isinstance(value, tuple) else [value] * n
         return [float(given[k]) for k in columns.order]
 
     sign = tuple(round(a * b) for a, b in zip(each(log.sign), columns.sign.tolist(), strict=True))
-    kept = {key: value for key, value in log.columns.items() if key.partition("_")[0] not in ("dl", "pos")}
+    kept = {key: value for key, value in log.columns.items() if key.partition("_")[0] not in (kind, "pos")}
     pos = {}
     if "pos_1" in log.sources:
         pos = {"pos": tuple(log.sources[f"pos_{k + 1}"] for k in columns.order)}
     made = replace(
         log,
-        columns={**kept, "dl": tuple(names[k] for k in columns.order), **pos},
-        sign=sign[0] if len(set(sign)) == 1 else sign,
+        columns={**kept, kind: tuple(names[k] for k in columns.order), **pos},
+        sign=log.sign if robot.by_tension else sign[0] if len(set(sign)) == 1 else sign,
         offset=tuple(each(log.offset)) if isinstance(log.offset, tuple) else log.offset,
         drum_radius=tuple(each(log.drum_radius)) if isinstance(log.drum_radius, tuple) else log.drum_radius,
     )
@@ -162,10 +164,11 @@ def _facts(samples: LogSamples, robot: Robot, bend: Floats, left: float) -> dict
         f"every {step:.3g} s"
         + (f"; {gaps} gap{'s' if gaps > 1 else ''} in time, read as holds" if gaps else "")
     }
-    dl = 1e3 * np.asarray(log.dl)
-    if dl.shape[1]:
-        low, high = dl.min(axis=0), dl.max(axis=0)
-        facts["tendons"] = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True)) + " mm"
+    if robot.n_tendons:
+        driven = 1e3 * log.commands if log.tension is None else log.commands
+        ranges = zip(driven.min(axis=0), driven.max(axis=0), strict=True)
+        unit = "mm" if log.tension is None else "N"
+        facts["tendons"] = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in ranges) + f" {unit}"
         size = np.linalg.norm(bend, axis=-1)
         octant = np.floor(_OCTANTS * (np.arctan2(bend[..., 1], bend[..., 0]) / (2.0 * np.pi) + 0.5))
         said = []

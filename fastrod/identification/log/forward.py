@@ -127,7 +127,7 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
     time, dt = np.empty(len(ordered)), np.zeros(len(ordered))
-    t, dl = ordered.t, ordered.dl
+    t, dl = ordered.t, ordered.commands
     session = np.full(len(ordered), "") if ordered.session is None else ordered.session
     largest = max((np.abs(np.diff(dl[span], axis=0)).max(initial=0.0) for span in runs), default=0.0)
     for span in runs:
@@ -203,7 +203,7 @@ class PredictedRod:
             threads=threads,
         )
         # a step of first order goes by the tendons that are slack before it, and is wrong where others are
-        self._one_sided = any(tendon.unilateral for tendon in robot.tendons)
+        self._one_sided = any(tendon.unilateral for tendon in robot.tendons) and not robot.by_tension
         self.fine = _FINE if self._one_sided else 1.0
         """Of the usual steps of slopes: a tendon that goes slack or taut within one bends it."""
         self._tolerance = self.fine * TOLERANCE * robot.length
@@ -232,17 +232,14 @@ class PredictedRod:
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
         bend = segment_bends(state.rotation, len(robot.segments))
         self.answer = RodAnswer(np.nan_to_num(state.tension), np.nan_to_num(bend))
-        points = np.zeros((len(state.ok), 0, 3))
-        if self.points:
-            points = (
-                self._sim.shape(
-                    np.minimum(np.array(robot.log_points), np.nanmin(state.arclength[:, -1]))
-                ).position
-                - ports.base_pose[:, None, :3]
-            )
-        return PredictedPose(
-            *from_base(ports.base_pose, state.tip_position, state.tip_rotation, points), state.ok
-        )
+        points, tip, tip_rotation = np.zeros((len(state.ok), 0, 3)), state.tip_position, state.tip_rotation
+        if self.points or self._log.without_tip:
+            found, rotation = self._sim.markers()
+            if self._log.without_tip:
+                found, tip, tip_rotation = found[:, :-1], found[:, -1], rotation[:, -1]
+            if self.points:
+                points = found - ports.base_pose[:, None, :3]
+        return PredictedPose(*from_base(ports.base_pose, tip, tip_rotation, points), state.ok)
 
     @property
     def of_modes(self) -> bool:
@@ -270,7 +267,7 @@ class PreparedLog:
     params: Params
     reader: Reader
     dl: Floats
-    """(n, n_tendons) commanded, of every sample [m]."""
+    """(n, n_tendons) commanded, of every sample, negative = pulled: lengths [m], or forces [N]."""
     base_rotation: Floats
     """(n_rows, 3, 3) or (1, 3, 3)."""
     tension: Floats | None = None
@@ -327,8 +324,9 @@ class PreparedLog:
         at_rows = self.samples.session[self.samples.rows]
         swept = 1 + max((i for i, each in enumerate(links) if _of_tendons(each)), default=-1)
         if swept:
-            alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
+            alone = Ports(*(a[:1] for a in self.ports))
             every = self._open(alone, len(self.dl), self.samples.time, self.base_rotation[:1])
+            every.tendon_length = self.dl + rest
             if self.tension is not None:
                 every.solved_tension = self.tension
             for each in links[:swept]:
@@ -457,7 +455,7 @@ def prepare_log(
         ports,
         params,
         reader,
-        np.asarray(samples.log.dl),
+        samples.log.pulls,
         matrix_from_quaternion(ports.base_pose[:, 3:]),
         None if like is None else like.tension,
         None if like is None else like.beyond,

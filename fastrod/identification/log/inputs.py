@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fastrod.errors import InputError
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
@@ -22,7 +23,9 @@ def tendon_length(log: RunLog, robot: Robot) -> Floats | None:
 def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
     """Keyword inputs of `Simulator.settle` for the rows of `log`: world frame, SI, robot axis first."""
     given: dict[str, Floats] = {}
-    if (lengths := tendon_length(log, robot)) is not None:
+    if log.tension is not None:
+        given["tension"] = log.tension
+    elif (lengths := tendon_length(log, robot)) is not None:
         given["tendon_length"] = lengths
     if log.ext is not None:
         given["extension"] = log.ext
@@ -32,6 +35,22 @@ def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
     if log.tip_force is not None or log.payload is not None:
         given["tip_force"] = _tip_force(log, robot)
     return given
+
+
+def check_driven(log: RunLog, robot: Robot) -> None:
+    """Raises `InputError` for a robot that is driven by lengths and by forces, or by what the log lacks."""
+    modes = {segment.mode for segment in robot.segments if segment.tendons}
+    if "tendon_tension" in modes and len(modes) > 1:
+        raise InputError(
+            f"robot {robot.name!r} has segments in mode 'tendon_tension' and others; a run log gives the "
+            "lengths of all tendons, or the forces on all."
+        )
+    if robot.by_tension != (log.tension is not None):
+        driven, given = ("forces", "lengths") if robot.by_tension else ("lengths", "forces")
+        raise InputError(
+            f"robot {robot.name!r} is driven by tendon {driven}, and log {log.name!r} gives {given}; mode of "
+            f"its segments would be 'tendon_{'length' if robot.by_tension else 'tension'}'."
+        )
 
 
 def base_of(log: RunLog, robot: Robot) -> tuple[Floats, Floats]:

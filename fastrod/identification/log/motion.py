@@ -69,7 +69,7 @@ class MotionReplay:
             rods,
             dt=clock.dt,
             points_per_segment=4,
-            outputs="full" if self.points or rods[0].effects else "tip",
+            outputs="full" if self.points or self.samples.log.without_tip or rods[0].effects else "tip",
             threads=self.threads or 1,
             dynamics=True,
         )
@@ -87,8 +87,10 @@ class MotionReplay:
             alive &= state.ok
             if step == clock.wanted[len(seen)]:
                 kept[len(seen)] = alive
-                found = sim.measure()
-                flat = [np.reshape(a, (len(rods), -1)) for a in found]
+                tip, rotation, points = sim.measure()
+                if self.samples.log.without_tip:
+                    tip, points = points[:, -1], points[:, :-1]
+                flat = [np.reshape(a, (len(rods), -1)) for a in (tip, rotation, points)]
                 seen.append(np.concatenate(flat, axis=1))
             if progress is not None and step % 100 == 0:
                 progress(step, last)
@@ -181,8 +183,7 @@ def _swings(tip: Floats) -> Floats | None:
 
 def _is_still(log: RunLog) -> bool:
     """Whether no input changes."""
-    inputs = (log.dl, log.ext, log.tip_force, log.payload, log.base_quaternion)
-    return all(np.ptp(a, axis=0).max(initial=0.0) < 1e-9 for a in inputs if a is not None)
+    return float(np.ptp(log.inputs, axis=0).max(initial=0.0)) < 1e-9
 
 
 def _beside_rest(samples: LogSamples, runs: Sequence[slice]) -> Floats:
@@ -219,7 +220,7 @@ def predict_motion(
     every = samples.on(samples.given)
     (pose,) = MotionReplay(every, points=points).poses([[robot]], progress)
     tip, ok = np.full((len(log), 3), np.nan), np.zeros(len(log), bool)
-    further = np.full((len(log), len(robot.log_points) if points else 0, 3), np.nan)
+    further = np.full((len(log), pose.points.shape[1], 3), np.nan)
     tip[rows], further[rows], ok[rows] = pose.position, pose.points, pose.ok
     return tip, further, ok
 

@@ -76,12 +76,7 @@ def at_rest(samples: LogSamples, settle: float = _SETTLE) -> list[Ints]:
     """Stretches of rows at which no input has moved for `settle` [s]: arrays of indices into
     `samples.rows`."""
     log = samples.log
-    drives = [log.dl] + [
-        a.reshape(len(log), -1)
-        for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
-        if a is not None
-    ]
-    every = np.concatenate(drives, axis=1)
+    every = log.inputs
     span = np.maximum(np.ptp(every, axis=0), 1e-12)
     moved = (np.abs(np.diff(every, axis=0)) > _STILL * span).any(1)
     moved = np.concatenate([[True], moved | (samples.dt[1:] <= 0.0)])

@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fastrod.identification.log.forward import LogSamples
 from fastrod.model.robot import Robot
+from fastrod.model.routing import route
 from fastrod.types import Floats, Ints
 
 _BEND = 0.2  # rad, by which the model is bent for its answers
@@ -48,7 +49,7 @@ def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> Column
     rotated together about its axis: of a robot whose segments stand at unknown angles, seen by a camera that
     does."""
     log, rows = samples.log, samples.rows
-    dl, tip = np.asarray(log.dl)[rows], np.asarray(log.tip_position)[rows]
+    dl, tip = log.pulls[rows], np.asarray(log.tip_position)[rows]
     if dl.shape[1] != robot.n_tendons or robot.n_tendons < 2 or len(rows) < 3 * robot.n_tendons:
         return None
     measured, model = -_answer(dl, tip), -_answers(robot)
@@ -81,10 +82,16 @@ def _answers(robot: Robot) -> Floats:
     from fastrod.simulator import Simulator
 
     n = robot.n_tendons
-    step = _BEND * float(min(np.min(t.offset) for t in robot.tendons))
+    wiring = route(robot)
+    step = _BEND / float(np.abs(wiring.bend_from_tendons).max())
     sim = Simulator(replace(robot, effects=()), n_robots=2 * n, points_per_segment=6)
     pulls = step * np.concatenate([np.eye(n), -np.eye(n)])
-    tip = np.nan_to_num(sim.settle(tendon_length=robot.rest_tendon_length + pulls).tip_position)
+    state = (
+        sim.settle(tension=-pulls)
+        if wiring.by_tension
+        else sim.settle(tendon_length=robot.rest_tendon_length + pulls)
+    )
+    tip = np.nan_to_num(state.tip_position)
     return np.asarray((tip[:n] - tip[n:]) / (2.0 * step))
 
 

@@ -45,6 +45,13 @@ _SCALES = {
     10.0: "a decimal place",
     1e3: "converted twice",
 }
+_FORCES = {
+    9.80665: "kgf to N",
+    9.80665e-3: "gf to N",
+    4.448222: "lbf to N",
+    1e-3: "mN to N",
+    0.1: "a decimal place",
+}
 _AS_GOOD = 1.3  # times what a moved camera leaves
 # times as closely by other signs or another order: no effect is that; two tendons exchanged: 9 times
 _MANY = 2.5
@@ -121,7 +128,7 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
     mirrored = look.mirrored.left < min(enough, _BETTER * frame.left)
     if mirrored and mixed_up:
         # drives of both signs are rarer than a reversed axis, other readings more frequent
-        plain = "the sign of dl_" not in words
+        plain = "the sign of dl_" not in words and "the sign of tension_" not in words
         mirrored = look.mirrored.left < (_BETTER if plain else 1.0 / _BETTER) * left
     guess = ""
     if mirrored:
@@ -225,7 +232,7 @@ class _Look:
         )
         self.motion = size(self.tip - np.median(self.tip, axis=0))
         """[m]."""
-        pose = self._pose(np.asarray(samples.log.dl))
+        pose = self._pose(samples.log.pulls)
         # of inputs in another unit the rests are solved
         self.solved = int(pose.ok.sum()) >= max(_LEAST, len(rows) // 2)
         self.as_it_is = self.centred = np.inf
@@ -252,8 +259,8 @@ class _Look:
             frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
         )
 
-    def _pose(self, dl: Floats) -> PredictedPose:
-        samples = replace(self.samples, log=replace(self.samples.log, dl=dl))
+    def _pose(self, pulls: Floats) -> PredictedPose:
+        samples = replace(self.samples, log=self.samples.log.with_pulls(pulls))
         return predict(self.model, self.model.start, samples, self.rod)
 
     def _aligned(self, pose: PredictedPose, *, mirrored: bool = False) -> CameraRegistration:
@@ -280,36 +287,37 @@ def _declared(robot: Robot, found: CameraRegistration) -> bool:
 
 def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[tuple[Floats, str]]:
     """Tendon lengths (n, n_tendons) as they may have been meant, and how in words."""
-    dl = np.asarray(samples.log.dl)
-    n = dl.shape[1]
+    dl, forces = samples.log.pulls, samples.log.tension is not None
+    n, kind = dl.shape[1], "tension" if forces else "dl"
     if not n or not np.ptp(dl, axis=0).any():
         return
-    yield -dl, _words(np.arange(n), -np.ones(n))
+    if not forces:
+        yield -dl, _words(np.arange(n), -np.ones(n), kind)
     if (found := column_order(samples, robot)) is not None:
-        yield found.of(dl), _words(found.order, found.sign)
+        yield found.of(dl), _words(found.order, found.sign, kind)
     for i, j in combinations(range(n), 2):
         if n <= _FEW or j == i + 1:
             order = np.arange(n)
             order[[i, j]] = j, i
-            yield dl[:, order], _words(order, np.ones(n))
-    for factor, words in _SCALES.items():
+            yield dl[:, order], _words(order, np.ones(n), kind)
+    for factor, words in (_FORCES if forces else _SCALES).items():
         # a rod that bends far moves less than in proportion: not the very factor
         fewer = not np.isfinite(scale) or scale < 1.0
-        if (factor < 1.0) == fewer and factor * float(np.abs(dl).max()) < robot.length:
-            yield factor * dl, f"every dl_ times {factor:.4g} ({words})"
+        if (factor < 1.0) == fewer and (forces or factor * float(np.abs(dl).max()) < robot.length):
+            yield factor * dl, f"every {kind}_ times {factor:.4g} ({words})"
 
 
-def _words(order: Ints, sign: Floats) -> str:
-    """An order of the columns and their signs, as a user would say them."""
+def _words(order: Ints, sign: Floats, kind: str) -> str:
+    """An order of the columns of a `kind` and their signs, as a user would say them."""
     moved = np.flatnonzero(order != np.arange(len(order))) + 1
     said = []
     if len(moved) == 2:
-        said.append(f"dl_{moved[0]} and dl_{moved[1]} exchanged")
+        said.append(f"{kind}_{moved[0]} and {kind}_{moved[1]} exchanged")
     elif len(moved):
-        said.append(f"the dl_ columns in the order {', '.join(map(str, order + 1))}")
+        said.append(f"the {kind}_ columns in the order {', '.join(map(str, order + 1))}")
     reversed_ = np.sort(order[sign < 0.0]) + 1
     if len(reversed_) == len(order):
-        said.append("the sign of every dl_ reversed")
+        said.append(f"the sign of every {kind}_ reversed")
     elif len(reversed_):
-        said.append(f"the sign of {', '.join(f'dl_{k}' for k in reversed_)} reversed")
+        said.append(f"the sign of {', '.join(f'{kind}_{k}' for k in reversed_)} reversed")
     return " and ".join(said)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.errors import InputError, LogError
-from fastrod.identification.log.inputs import base_of, inputs
+from fastrod.errors import LogError
+from fastrod.identification.log.inputs import base_of, check_driven, inputs
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog, log_of
@@ -131,18 +131,18 @@ def replay(
     """
     robot = robot_of(robot)
     log = log_of(log, robot)
-    _check_driven_by_lengths(robot)
+    check_driven(log, robot)
     if not log.measured.any():
         raise LogError(
             f"log {log.name!r} has no row in which every input and the tip are there; there is "
             "nothing to compare."
         )
     open_questions: tuple[str, ...] = ()
-    n_points = 0 if log.points is None else len(robot.log_points)
+    n_points = 0 if log.points is None else log.points.shape[1]
     if dynamics:
         from fastrod.identification.log.motion import predict_motion  # it loads numba
 
-        tip, points, converged = predict_motion(log, robot, points=n_points > 0, progress=progress)
+        tip, points, converged = predict_motion(log, robot, points=log.points is not None, progress=progress)
     else:
         if simulator is None:
             # it loads numba, which no other command line word needs
@@ -175,7 +175,7 @@ def _at_rest(
 
         simulator = Simulator
         if robot.effects:
-            rows, solved = _with_effects(log, robot, n_points > 0)
+            rows, solved = _with_effects(log, robot, log.points is not None)
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
         tip[chunk], points[chunk], converged[chunk] = (
@@ -205,27 +205,17 @@ def _with_effects(
     return samples.origin[samples.given], solved
 
 
-def _check_driven_by_lengths(robot: Robot) -> None:
-    for number, segment in enumerate(robot.segments, 1):
-        if segment.mode == "tendon_tension":
-            raise InputError(
-                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a run log gives "
-                "tendon lengths; "
-                "replay it in mode 'tendon_length'."
-            )
-
-
 def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Floats, Floats, Flags]:
     """Tip (n, 3) and further points (n, k, 3) in the base frame [m], and which rows converged, of one
     batch."""
     sim = simulator(robot, n_robots=len(log))
     state = sim.settle(**inputs(log, robot))
     rotation, origin = base_of(log, robot)
-    points = np.zeros((len(log), 0, 3))
+    points, tip = np.zeros((len(log), 0, 3)), np.asarray(state.tip_position, dtype=np.float64)
     if log.points is not None and robot.log_points:
-        shape = sim.shape(np.array(robot.log_points))
-        points = np.asarray(shape.position, dtype=np.float64)
-    tip = np.asarray(state.tip_position, dtype=np.float64)
+        points, _ = sim.markers()
+    if log.without_tip:
+        points, tip = points[:, :-1], points[:, -1]
     return (
         _into_base(tip[:, None] - origin, rotation)[:, 0],
         _into_base(points - origin, rotation),

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.errors import InputError, LogError, UnknownNameError, nearest
+from fastrod.errors import LogError, UnknownNameError, nearest
 from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.inputs import check_driven
 from fastrod.identification.log.motion import let_go
 from fastrod.logs.drives import sentences
 from fastrod.logs.runlog import RunLog
@@ -42,8 +43,9 @@ class SplitLog:
 
 def split(logs: Sequence[RunLog], robot: Robot, held_out: Sequence[str]) -> SplitLog:
     """The samples of `logs` of `robot`; `held_out` as for `held_out_rows`. Raises `LogError` where they
-    cannot tell anything, `InputError` for a robot that is driven by tensions."""
+    cannot tell anything, `InputError` for a robot that is driven by lengths and by forces."""
     log = merged(logs)
+    check_driven(log, robot)
     for label in log.runs if log.session is not None else []:
         named = np.unique(np.asarray(log.session)[log.run == label]).tolist()
         if len(named) > 1:
@@ -98,6 +100,10 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
     if len({log.points.shape[1] for log in logs if log.points is not None}) > 1:
         raise LogError("the logs have different numbers of points; they must be of one robot.")
+    if len({log.without_tip for log in logs}) > 1:
+        raise LogError(
+            "some logs have a measured tip and others have none; give those with the same columns."
+        )
     columns: dict[str, Any] = {}
     if any(log.session is not None for log in logs):
         columns["session"] = np.concatenate(
@@ -107,7 +113,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         columns["pos"] = np.concatenate(
             [np.full(log.dl.shape, np.nan) if log.pos is None else log.pos for log in logs]
         )
-    optional = ("ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
+    optional = ("tension", "ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
     for name in optional:
         pieces = [getattr(log, name) for log in logs]
         have = [span is not None for span in pieces]
@@ -134,6 +140,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         run=np.concatenate(labels),
         dl=np.concatenate([log.dl for log in logs]),
         tip_position=np.concatenate([log.tip_position for log in logs]),
+        without_tip=logs[0].without_tip,
         **columns,
     )
 
@@ -202,25 +209,10 @@ def check_log(samples: LogSamples, robot: Robot, swings: bool = False) -> None:
             f"log {log.name!r} has {measured} measured rows; identification needs {_LEAST_ROWS} "
             "at least, better two thousand."
         )
-    inputs = [
-        log.dl,
-        *(
-            a.reshape(len(log), -1)
-            for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
-            if a is not None
-        ),
-    ]
-    moves = np.concatenate([np.ptp(a, axis=0) for a in inputs]) if inputs else np.zeros(0)
-    if not (moves > 1e-9).any() and not swings:
+    if not (np.ptp(log.inputs, axis=0) > 1e-9).any() and not swings:
         raise LogError(
             f"in log {log.name!r} no input ever changes; nothing can be learnt from it. fastrod "
             "excite writes a run that does."
         )
     if float(np.ptp(np.asarray(log.tip_position)[log.measured], axis=0).max()) < 1e-7 * robot.length:
         raise LogError(f"in log {log.name!r} the measured tip never moves; is the camera's column filled?")
-    for mode, number in ((s.mode, k) for k, s in enumerate(robot.segments, 1)):
-        if mode == "tendon_tension":
-            raise InputError(
-                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a "
-                "run log gives tendon lengths."
-            )

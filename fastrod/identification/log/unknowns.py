@@ -13,7 +13,7 @@ import numpy as np
 
 from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
-from fastrod.model.robot import Robot
+from fastrod.model.robot import Robot, Segment
 from fastrod.model.routing import Routing, route
 from fastrod.types import Floats
 
@@ -27,6 +27,9 @@ SEGMENT_UNITS = {
     "shear_stiffness": "N",
 }
 """Parameters of a segment that can be fitted, and their units."""
+MATERIAL = ("youngs_modulus", "density", "taper")
+"""Those of all segments together, `material.youngs_modulus` and so on: a factor on all stiffness, one on all
+mass, and the fraction by which the radius that makes both is larger at the base and smaller at the tip."""
 TENDON_UNITS = {
     "offset": "m",
     "angle": "rad",
@@ -274,6 +277,8 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
     """`robot` with one unknown set; a shared one is a factor on, or an addition to, each nominal value."""
     _, kind, *numbers = unknown.place
     segments = list(robot.segments)
+    if kind == "material":
+        return replace(robot, segments=_of_material(robot, numbers[0], value))
     if kind == "mass":
         k, m = map(int, numbers[0].split("."))
         masses = list(segments[k].lumps)
@@ -306,7 +311,35 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             tendons[place] = replace(tendons[place], **{kind: new})
             # set again when all is known
             segments[k] = replace(segments[k], tendons=tuple(tendons), body_radius=0.0)
-    return replace(robot, segments=tuple(segments), log_points=())
+    return replace(robot, segments=tuple(segments), log_points=(), log_offsets=())
+
+
+def _of_material(robot: Robot, kind: str, value: float) -> tuple[Segment, ...]:
+    """The segments with another modulus or density, a factor, or as stiff and heavy as if their radius were
+    larger by this fraction at the base and smaller at the tip."""
+    middle = np.cumsum([s.length for s in robot.segments]) - 0.5 * np.array(
+        [s.length for s in robot.segments]
+    )
+    made = []
+    for segment, at in zip(robot.segments, middle, strict=True):
+        radius = 1.0 + value * (1.0 - 2.0 * at / robot.length) if kind == "taper" else 1.0
+        modulus = value if kind == "youngs_modulus" else 1.0
+        bending, area = float(modulus * radius**4), float(modulus * radius**2)
+        density = (value if kind == "density" else 1.0) * float(radius**2)
+        made.append(
+            replace(
+                segment,
+                bending_stiffness=(
+                    bending * segment.bending_stiffness[0],
+                    bending * segment.bending_stiffness[1],
+                ),
+                torsional_stiffness=bending * segment.torsional_stiffness,
+                axial_stiffness=area * segment.axial_stiffness,
+                shear_stiffness=area * segment.shear_stiffness,
+                line_density=density * segment.line_density,
+            )
+        )
+    return tuple(made)
 
 
 def _wrapped(angle: float) -> float:
@@ -324,9 +357,8 @@ def _whole(robot: Robot, nominal: Robot) -> Robot:
         replace(s, body_radius=max(n.body_radius, w) if n.body_radius else 0.0)
         for s, n, w in zip(robot.segments, nominal.segments, widest, strict=True)
     )
-    return replace(
-        robot, segments=segments, log_points=tuple(min(s, robot.length) for s in nominal.log_points)
-    )
+    points = tuple(min(s, robot.length) for s in nominal.log_points)
+    return replace(robot, segments=segments, log_points=points, log_offsets=nominal.log_offsets)
 
 
 def _range(extension: tuple[float, float], length: float) -> tuple[float, float]:

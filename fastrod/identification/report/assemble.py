@@ -186,7 +186,9 @@ def assemble(
         estimates = {name: e for name, e in estimates.items() if name not in effects[0].parameters}
     wiring = final.model.wiring
     lacks = (
-        advice.missing_excitation(explained.search.samples, wiring.bend(np.asarray(samples.log.dl)))
+        advice.missing_excitation(
+            explained.search.samples, wiring.of_sections(wiring.bend(samples.log.pulls))
+        )
         if wiring.n_tendons
         else []
     )

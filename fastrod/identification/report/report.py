@@ -209,6 +209,8 @@ def table(result: Result) -> Group:
         for f in result.effects
         if f.cannot_be_told_from
     ]
+    wanted = [(n, e) for n, e in result.base_parameters.items() if e.identifiable and n in result.robot.fit]
+    lines += [f"[fit] {plain_name(n)}: {with_error(e.value, e.stderr, e.unit)}" for n, e in wanted]
     lines += [
         f"not identifiable: {plain_name(name)}, {e.why}"
         for name, e in result.base_parameters.items()

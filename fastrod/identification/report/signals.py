@@ -63,7 +63,7 @@ class Signals:
         self.run: Ints = number[self.rows]
         wiring = route(result.robot)
         n = wiring.n_segments if wiring.n_tendons else 0
-        self.bend: Floats = wiring.bend(np.asarray(log.dl)) if n else np.zeros((len(self.rows), 0, 2))
+        self.bend: Floats = wiring.bend(log.pulls) if n else np.zeros((len(self.rows), 0, 2))
         self.time = self._time()
 
     def _time(self) -> Floats:

@@ -60,7 +60,7 @@ def _commands(name: str, state: ModelState, log: RunLog) -> tuple[LogSamples, Fl
     """Samples of one bend that swings, or of a straight robot over the log's time for an effect of time; with
     the signal to draw against."""
     wiring = state.model.wiring
-    bend = wiring.bend(np.asarray(log.dl))
+    bend = wiring.bend(log.pulls)
     size = np.linalg.norm(bend, axis=-1).max(axis=0)
     k = int(np.argmax(size))
     direction = np.zeros(bend.shape[1:])
@@ -81,9 +81,16 @@ def _commands(name: str, state: ModelState, log: RunLog) -> tuple[LogSamples, Fl
     if _of_time(name):
         t = np.linspace(0.0, float(np.ptp(log.t)), _ROWS)
         signal, label, swing = t, "time [s]", 0.0 * swing
-    dl = wiring.tendon_change(swing[:, None, None] * direction)
-    made = RunLog(name=name, t=t, run=np.full(_ROWS, ""), dl=dl, tip_position=np.zeros((_ROWS, 3)))
-    return sample(made), signal, label
+    pulls = wiring.tendon_change(swing[:, None, None] * direction)
+    blank = RunLog(
+        name=name,
+        t=t,
+        run=np.full(_ROWS, ""),
+        dl=np.zeros_like(pulls),
+        tip_position=np.zeros((_ROWS, 3)),
+        tension=None if log.tension is None else np.zeros_like(pulls),
+    )
+    return sample(blank.with_pulls(pulls)), signal, label
 
 
 def _of_time(name: str) -> bool:

@@ -198,7 +198,7 @@ def _sway(linearised: LinearisedModel, residual: Floats) -> Iterator[Alternative
 
 def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
     wiring = linearised.model.wiring
-    if not linearised.model.wiring.n_tendons:
+    if not wiring.n_tendons or wiring.by_tension:
         return
     dl = linearised.prepared.dl[linearised.samples.rows]
     span = float(np.ptp(dl, axis=0).max())

@@ -178,13 +178,15 @@ class LinearisedModel:
 
     @cached_property
     def by_length(self) -> Floats:
-        """(n, 6 + 3k, n_tendons) per m of tendon length. A body that can shorten answers to each tendon by
-        itself, any other only to the bend that the lengths ask for."""
+        """(n, 6 + 3k, n_tendons) per m of tendon length, or N. A body that can shorten answers to each tendon
+        by itself, any other only to the bend that the lengths ask for."""
         wiring, n = self.model.wiring, self.model.wiring.n_tendons
         if not n:
             return np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
         if any(math.isfinite(s.axial_stiffness) for s in self.robot.segments):
             changes, steps, back = np.eye(n), self.rod.fine * _BEND * wiring.tendon_offset, np.eye(n)
+            if wiring.by_tension:
+                steps = self.rod.fine * _BEND / np.abs(wiring.bend_from_tendons).max(0)
         else:
             bends = np.eye(2 * wiring.n_segments).reshape(-1, wiring.n_segments, 2)
             changes, back = wiring.tendon_change(bends), wiring.bend_from_tendons

@@ -134,7 +134,7 @@ def faster_than_commands(samples: LogSamples, residual: Floats) -> tuple[float, 
             continue
         dt = float(np.median(np.diff(t)))
         even = np.arange(t[good][0], t[good][-1], dt)
-        columns = np.column_stack([left, np.asarray(samples.log.dl)[span]])
+        columns = np.column_stack([left, samples.log.commands[span]])
         values = np.stack([np.interp(even, t[good], column[good]) for column in columns.T], axis=1)
         window = np.hanning(len(even))[:, None]
         power = np.abs(np.fft.rfft((values - values.mean(0)) * window, axis=0)) ** 2
@@ -198,9 +198,7 @@ def _ridge(
 def features(samples: LogSamples, wiring: Routing) -> tuple[Floats, Floats, Floats]:
     """Static, memory and time features (n_rows, any), each of about unit size."""
     log, rows = samples.log, samples.rows
-    bend = (
-        wiring.bend(np.asarray(log.dl)).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))
-    )
+    bend = wiring.bend(log.pulls).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))
     top = max(float(np.abs(bend).max(initial=0.0)), 1e-9)
     b = bend / top
     others = [

@@ -64,8 +64,10 @@ def are_worth_trying(base: BaseFit, left: float) -> bool:
     robot, tip = base.robot, base.search.target.tip
     motion = float(np.sqrt(((tip - tip.mean(0)) ** 2).sum(1).mean()))
     ends = np.bincount(np.asarray(robot.tendon_segment, dtype=int), minlength=1)
-    known = any(t.unilateral for t in robot.tendons) or any(
-        math.isfinite(s.axial_stiffness) or s.extension != (0.0, 0.0) for s in robot.segments
+    known = (
+        robot.by_tension
+        or any(t.unilateral for t in robot.tendons)
+        or any(math.isfinite(s.axial_stiffness) or s.extension != (0.0, 0.0) for s in robot.segments)
     )
     much = left > max(_LEFT * motion, _FLOORS * base.noise.floor)
     return bool(ends.max(initial=0) >= 2) and not known and much
