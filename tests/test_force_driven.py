@@ -243,6 +243,13 @@ def test_force_in_other_unit_is_questioned() -> None:
 
 
 @pytest.mark.study(beyond=0)
+def test_robot_that_hangs_and_is_said_to_stand_is_refused() -> None:
+    log = seen(arm(), forces(80))
+    found = fastrod.check(log, replace(arm(), base_quaternion=(1.0, 0.0, 0.0, 0.0)))
+    assert "[0, 1, 0, 0] of one that hangs" in found.refusal
+
+
+@pytest.mark.study(beyond=0)
 def test_modulus_density_and_taper_are_fitted() -> None:
     """Of a body that is 1.3 times as stiff, 0.9 times as heavy and more tapered than its file says."""
     from fastrod.identification.log.unknowns import _of_material

@@ -19,6 +19,7 @@ from fastrod.model.logformat import UNITS
 from fastrod.model.robotfile import loads
 
 _UNIT = re.compile(r"[_\s\[(]+(ms|us|ns|sec|s|mm|cm|um|m|deg|rad|rev|n|mn|kgf|gf)[\])]?$", re.IGNORECASE)
+_BASES = {"stands": [1, 0, 0, 0], "hangs": [0, 1, 0, 0]}
 _DRIVES = ("pull", "push-pull", "force")
 
 
@@ -80,6 +81,7 @@ _ROBOT = (
     ),
 )
 _MATERIAL = (
+    _Question("base", "how is it mounted (stands, hangs)?", "stands", _one_of([*_BASES])),
     _Question("radius", "radius of the body [mm], or at base and tip; tendons keep their share", "12", _ends),
     _Question("youngs-modulus", "Young's modulus [kPa]", "100", _positive),
     _Question("density", "density [kg/m^3]", "1070", _positive),
@@ -253,7 +255,7 @@ def check(arguments: argparse.Namespace) -> int:
         line("wrote", str(arguments.out))
     if found.refusal and arguments.out is None:
         raise LogError(found.refusal)
-    if not found.refusal and found.columns is None:
+    if not found.refusal and not found.questions and found.columns is None:
         line("ok", "units, signs, order, clock and time fit the robot")
     return 0
 
@@ -364,6 +366,7 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
         ]
         lines += ['"segment.*.axial_stiffness" = { sd = 1e4 }']
     if forces:
+        lines[3:3] = ["", "[base]", f"quaternion = {_BASES[given['base']]}  # world_from_base, w x y z"]
         lines += ['"material.youngs_modulus" = { sd = 0.5 }', '"material.density" = { sd = 0.1 }']
         lines += ['"material.taper" = { sd = 0.1 }']
     lines += [
@@ -480,6 +483,8 @@ def _by_size(question: str, table: Table, names: Sequence[str], given: dict[str,
     from fastrod.logs.table import numbers
 
     values = np.stack([numbers(table, name, "the log") for name in names])
+    if question == "motor-unit" and given["drive"] == "force":
+        return "N"
     if question == "time-unit":
         step = float(np.nanmedian(np.diff(values[0]))) if values.shape[1] > 1 else 0.0
         return "ms" if 1.0 <= step < 1e4 else "ns" if step >= 1e5 else "s"

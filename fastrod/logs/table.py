@@ -6,6 +6,7 @@ import csv
 import math
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -66,16 +67,17 @@ def _read_csv(path: Path) -> Table:
     if (size := path.stat().st_size) > _MOST_BYTES:
         raise LogError(f"{path.name} has {size} bytes; a log may have {_MOST_BYTES}. Cut it in parts.")
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
+        lines = (line for line in file if not line.startswith("#"))
+        first = next((line for line in lines if line.strip()), "")
+        delimiter = max(",;\t", key=first.count)
+        rows = [row for row in csv.reader(chain([first], lines), delimiter=delimiter) if row]
+    if delimiter == ";":  # of a spreadsheet where a comma is the decimal point
+        rows[1:] = [[cell.replace(",", ".") for cell in row] for row in rows[1:]]
     if not rows:
         raise LogError(
             f"{path.name} is empty; a run log starts with a header such as t,dl_1,tip_x,tip_y,tip_z."
         )
     header = [name.strip() for name in rows[0]]
-    if len(header) == 1 and ";" in header[0]:
-        raise LogError(
-            f"{path.name} is separated by semicolons; a run log is separated by commas, with decimal points."
-        )
     _check_header(header, path.name)
     for number, row in enumerate(rows[1:], 1):
         if len(row) != len(header):

@@ -52,6 +52,10 @@ _FORCES = {
     1e-3: "mN to N",
     0.1: "a decimal place",
 }
+_HANGS = (
+    "gravity the other way along the base: [base] quaternion is [1, 0, 0, 0] of a robot that stands, and "
+    "[0, 1, 0, 0] of one that hangs"
+)
 _AS_GOOD = 1.3  # times what a moved camera leaves
 # times as closely by other signs or another order: no effect is that; two tendons exchanged: 9 times
 _MANY = 2.5
@@ -116,6 +120,8 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
     enough = as_it_is / _MANY if follows else min(_FOLLOWS * look.motion, _BETTER * as_it_is)
     moved = far and frame.left < enough
     tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
+    if any(s.line_density > 0.0 for s in robot.segments) and samples.log.base_quaternion is None:
+        tried.append((look.upside_down(), _HANGS))
     least = 1.02 * min((left for left, _ in tried), default=np.inf)
     # of readings that are alike the one that is said in the fewest words
     left, words = min(
@@ -258,6 +264,13 @@ class _Look:
         return (
             frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
         )
+
+    def upside_down(self) -> float:
+        """Distance that gravity the other way would leave [m]."""
+        moved = replace(self.robot, gravity=tuple(-g for g in self.robot.gravity))
+        pose = predict(known_model(moved), self.model.start, self.samples, self.rod)
+        good = int(pose.ok.sum()) >= max(_LEAST, len(pose.ok) // 2)
+        return self._aligned(pose).left if good else float("inf")
 
     def _pose(self, pulls: Floats) -> PredictedPose:
         samples = replace(self.samples, log=self.samples.log.with_pulls(pulls))
