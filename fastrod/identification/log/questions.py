@@ -267,7 +267,8 @@ class _Look:
 
     def upside_down(self) -> float:
         """Distance that gravity the other way would leave [m]."""
-        moved = replace(self.robot, gravity=tuple(-g for g in self.robot.gravity))
+        x, y, z = self.robot.gravity
+        moved = replace(self.robot, gravity=(-x, -y, -z))
         pose = predict(known_model(moved), self.model.start, self.samples, self.rod)
         good = int(pose.ok.sum()) >= max(_LEAST, len(pose.ok) // 2)
         return self._aligned(pose).left if good else float("inf")
