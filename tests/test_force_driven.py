@@ -302,10 +302,18 @@ def test_own_file_in_grams_to_run_log(tmp_path: Path, capsys: pytest.CaptureFixt
     options = (
         "--length 200 --tendons 4 --offset 11.4 --drive force --radius 15.4,6.4 --markers 50,100,150,190"
     )
-    command = ["new", str(made), "--log", str(raw), *options.split(), "--marker-offset", "12,10,8,7"]
+    command = [
+        "new",
+        str(made),
+        "--log",
+        str(raw),
+        *options.split(),
+        "--marker-offset",
+        "12,10,8,7",
+        "--base",
+        "hangs",
+    ]
     assert main(command) == 0
-    hanging = made.read_text() + "\n[base]\nposition = [0, 0, 0]\nquaternion = [0, 1, 0, 0]\n"
-    made.write_text(hanging)
     assert main(["check", str(raw), "--robot", str(made)]) == 0
     assert " N" in capsys.readouterr().out
     assert main(["import", str(raw), "--robot", str(made), "--out", str(tmp_path / "run.csv")]) == 0

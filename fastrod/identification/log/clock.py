@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
-from fastrod.identification.log.registration import align
+from fastrod.identification.log.registration import align, size
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -26,6 +26,7 @@ _STEPS = 10  # of the offsets on each side, and of each of these steps
 _STRETCHES, _LASTS = 5, 7.0  # of time that are looked at; s
 _FINEST, _COARSEST = 0.06, 0.25  # s between rows of these
 _LEAST = 30  # of them compared
+_FOLLOWS = 0.5  # of the motion
 _BETTER = 0.8  # of what is left without it: less is the offset's merit
 
 
@@ -56,7 +57,9 @@ def clock_offset(samples: LogSamples, robot: Robot, threads: int | None = None) 
     rough = min(np.linspace(-LONGEST, LONGEST, 2 * _STEPS + 1), key=left)
     best = float(min(rough + np.linspace(-1.0, 1.0, 2 * _STEPS + 1) * LONGEST / _STEPS, key=left))
     step = float(np.median(np.diff(time)))
-    known = best > max(step, 2.0 * LONGEST / _STEPS**2) and left(best) < _BETTER * left(0.0)
+    # a model that does not follow says nothing of a clock
+    least = min(_BETTER * left(0.0), _FOLLOWS * size(tip - np.median(tip, axis=0)))
+    known = best > max(step, 2.0 * LONGEST / _STEPS**2) and left(best) < least
     return best if known else 0.0
 
 
