@@ -18,6 +18,22 @@ UNITS: dict[str, dict[str, float]] = {
     "mass": {"kg": 1.0, "g": 1e-3},
 }
 """SI per unit; `iso` is a date and time of day, as in 2026-05-12T09:30:00.125."""
+COLUMNS = {
+    "t": "time, not decreasing within a run [s]",
+    "run": "label of the run: data are held out by run",
+    "session": "label of the session: zeros, registration and delay are of a session",
+    "dl_1 ... dl_n": "change of each tendon's length from the straight robot, negative = pulled [m]",
+    "tension_1 ... tension_n": "force on each tendon in place of its length, in mode tendon_tension [N]",
+    "pos_1 ... pos_n": "measured positions of the drives, counted as dl_k [m]",
+    "ext_1 ... ext_n": "change of each segment's length [m]",
+    "tip_x, tip_y, tip_z": "measured tip, base frame [m]",
+    "tip_qw, tip_qx, tip_qy, tip_qz": "measured orientation of the tip, base_from_tip",
+    "p1_x, p1_y, p1_z ...": "measured points at the arclengths of [log] points, base frame [m]",
+    "tip_fx, tip_fy, tip_fz": "known force on the tip, base frame [N]",
+    "payload": "known mass at the tip [kg]",
+    "base_qw, base_qx, base_qy, base_qz": "world_from_base: the direction of gravity",
+}
+"""Columns of a run log. Any other is kept and ignored; an empty cell drops its row from a fit."""
 AXES = {"tip": "xyz", "tip_f": "xyz", "tip_q": "wxyz", "base_q": "wxyz"}
 """Groups of columns with fixed axes: `tip` stands for tip_x, tip_y, tip_z, `tip_q` for tip_qw to tip_qz."""
 COUNTED = ("dl", "pos", "ext", "tension")

@@ -23,7 +23,13 @@ from fastrod.tomlfile import parse, read_text
 _LOG = tuple(f.name for f in fields(LogFormat))
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
 _MATERIAL = ("youngs_modulus", "poisson", "density")
-_SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
+SENSOR = {
+    "noise": "standard deviation of the measured tip, one number or one an axis [m]",
+    "registration_sd": "prior of the camera's place against the base: shift [m] and rotation [rad]",
+    "marker_offset_sd": "prior of the marker's place against the tip [m]",
+    "latency_sd": "prior of a delay between commands and camera [s]",
+}
+"""Keys of `[sensor]`. A prior of 0, or none, stands for what is known."""
 
 
 def robot_names() -> list[str]:
@@ -82,7 +88,7 @@ def loads(text: str, where: str = "robot file") -> Robot:
         "log": log or None,
         "effects": data.get("effect"),
         "fit": data.get("fit"),
-        "sensor": _section(data, "sensor", _SENSOR, where) or None,
+        "sensor": _section(data, "sensor", SENSOR, where) or None,
     }
     if "name" not in data:
         raise RobotError(f'{where} has no name; add name = "...".')

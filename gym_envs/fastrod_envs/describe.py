@@ -27,10 +27,9 @@ def summary() -> str:
     return "\n".join(lines)
 
 
-def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
-    """Documentation of a task: what it is, its options, observation and action number by number. Raises
-    `UnknownNameError`,
-    `InputError`."""
+def describe(name: str, options: Mapping[str, Any] | None = None, *, timed: bool = True) -> str:
+    """Documentation of a task: what it is, its options, observation and action number by number, and with
+    `timed` how fast it is here. Raises `UnknownNameError`, `InputError`."""
     kind = task_class(name)
     task = make_task(name, 1, options or {})
     try:
@@ -42,7 +41,7 @@ def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
             "Observation\n" + _fields(seen),
             "Action, each number from -1 to 1, which mean\n" + _fields(task.actions),
             "Options\n" + _options(kind.options_class),
-            _speed(name, kind.hosted, options or {}),
+            *([_speed(name, kind.hosted, options or {})] if timed else []),
         ]
     finally:
         task.close()

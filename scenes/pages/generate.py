@@ -1,0 +1,431 @@
+"""Pages of the documentation site: those that stand beside the code, and references made from the code.
+
+Run by `mkdocs build --strict` (mkdocs-gen-files), which writes nothing into the source tree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import inspect
+import io
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib as mpl
+import mkdocs_gen_files
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    "README.md": "index.md",
+    "fastrod/README.md": "rod.md",
+    "fastrod/GLOSSARY.md": "glossary.md",
+    "fastrod/contact/README.md": "contact.md",
+    "fastrod/identification/README.md": "identification.md",
+    "fastrod/hosts/README.md": "embedding.md",
+    "fastrod/generation/README.md": "data-sets.md",
+    "gym_envs/README.md": "environments.md",
+    "viewer/README.md": "viewer.md",
+    "viewer/film.gif": "film.gif",
+    "device/README.md": "prototype.md",
+    "scenes/README.md": "scenes.md",
+    "perf/README.md": "figures.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
+"""A file in the source tree -> its place on the site."""
+MADE = {
+    "robot-file.md": "Robot file",
+    "run-log.md": "Run log",
+    "effects.md": "Effects",
+    "commands.md": "Commands",
+    "errors.md": "Errors and what to do",
+    "citation.md": "Citation",
+}
+API = {
+    "fastrod": "simulate, identify, read and write",
+    "fastrod.contact": "obstacles",
+    "fastrod.hosts": "rods in PyBullet, MuJoCo and engines of your own",
+    "fastrod.control": "inverse kinematics, paths, arms with a soft tip",
+    "fastrod.generation": "data sets",
+    "fastrod.reference": "slow twins on scipy",
+    "fastrod_envs": "environments",
+    "fastrod_envs.sb3": "environments for stable-baselines3",
+    "fastrod_scenes": "scenes",
+}
+"""Packages whose public names the reference lists, and what they are for."""
+LAWS = ("Effect", "Law", "Static", "Operator", "BodyOperator", "Parameter", "Seam", "Signal", "effect")
+"""What an effect of one's own is made of, in `fastrod.effects.base`."""
+SECTIONS = {
+    "Segment": ("[[segment]]", "fastrod.model.robot"),
+    "Tendon": ("tendons of a segment", "fastrod.model.robot"),
+    "Lump": ("lumps of a segment", "fastrod.model.robot"),
+    "LogFormat": ("[log]", "fastrod.model.logformat"),
+}
+MATERIAL = {
+    "youngs_modulus": "Young's modulus of a round segment of radius body_radius, for its stiffness [Pa]",
+    "poisson": "with it, Poisson's ratio; left out: 0.3",
+    "density": "with it, in place of line_density [kg/m^3]",
+}
+TODO = {
+    "RobotError": "Correct the key that it names; `fastrod new` writes a robot file that works.",
+    "InputError": "Compare shape and unit with the sentence; `Simulator.step` lists the inputs.",
+    "LogError": "Run `fastrod check LOG --robot R`: it names units, signs, order and clock.",
+    "HostError": "Look the body or link up by the name that the engine gives it.",
+    "EffectError": "Compare the effect's parameters with its page under Effects.",
+    "UnknownNameError": "Take the nearest name that it gives, or one of those it lists.",
+}
+
+
+def write(place: str, text: str) -> None:
+    """One page of the site."""
+    with mkdocs_gen_files.open(place, "w") as file:
+        file.write(text)
+
+
+def copied(source: str, place: str) -> None:
+    """A page that stands beside the code, its links led to the site."""
+    if not source.endswith(".md"):
+        with mkdocs_gen_files.open(place, "wb") as picture:
+            picture.write((ROOT / source).read_bytes())
+        return
+
+    def led(match: re.Match[str]) -> str:
+        path, _, anchor = match[1].partition("#")
+        if not path or path.startswith("http"):
+            return match[0]
+        target = ((ROOT / source).parent / path).resolve().relative_to(ROOT).as_posix()
+        if target not in PAGES:
+            raise ValueError(f"{source} links to {path}, which is no page of the site; add it to PAGES.")
+        return f"]({PAGES[target]}{'#' if anchor else ''}{anchor})"
+
+    write(place, re.sub(r"\]\(([^)\s]+)\)", led, (ROOT / source).read_text("utf-8")))
+
+
+def rows(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
+    """A table."""
+    lines = [head, tuple("---" for _ in head), *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def documented(kind: type) -> dict[str, str]:
+    """The sentences below the fields of a dataclass, by name."""
+    (body,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(body, ast.ClassDef)
+    found: dict[str, str] = {}
+    for one, after in zip(body.body, [*body.body[1:], None], strict=True):
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
+            text = (
+                after.value.value
+                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                else ""
+            )
+            found[one.target.id] = " ".join(str(text).split())
+    return found
+
+
+def keys_of(kind: type) -> str:
+    """The keys that the fields of a dataclass are in a robot file."""
+    body = []
+    for name, text in documented(kind).items():
+        field = kind.__dataclass_fields__[name]  # type: ignore[attr-defined]
+        default = getattr(field, "default", None)
+        plain = "" if "MISSING" in repr(default) else f"`{default!r}`"
+        body.append((f"`{name}`", text, plain))
+    if kind.__name__ == "Segment":
+        body += [(f"`{name}`", text, "") for name, text in MATERIAL.items()]
+    return rows(("key", "meaning", "default"), body)
+
+
+def robot_file() -> None:
+    """Every key of a robot file."""
+    from fastrod.commands.own import _robot_text
+    from fastrod.identification.log.unknowns import MATERIAL as OF_ALL
+    from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS
+    from fastrod.model.robotfile import SENSOR
+
+    text = [
+        "# Robot file",
+        "A robot is a TOML file. `fastrod new mine.toml` asks for the numbers and writes one.",
+    ]
+    given = {
+        "segments": 1,
+        "tendons": [3],
+        "length": [100.0],
+        "offset": [8.0],
+        "angle": [0.0],
+        "drive": "pull",
+    }
+    text += [f"```toml\n{_robot_text('mine', given).strip()}\n```"]
+    for name, (title, module) in SECTIONS.items():
+        kind = getattr(importlib.import_module(module), name)
+        first = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("\n", " ")
+        text += [f"## {title}", first, keys_of(kind)]
+        if name == "LogFormat":
+            more = [("`points`", "arclengths of the measured points p1 ... pk [m]")]
+            more += [("`point_offsets`", "where these lie beside the backbone, along d1 and d2 [m]")]
+            text += [rows(("key beside these", "meaning"), more)]
+    text += [
+        "A segment with two numbers in `body_radius`, at its base and its end, tapers; a tendon with one more"
+    ]
+    text += ["`offset` than it crosses segments lies on a cone. Such a segment becomes ten even pieces."]
+    others = [
+        ("`[base] position`", "of the base, world frame [m]", "`[0, 0, 0]`"),
+        ("`[base] quaternion`", "world_from_base, w x y z; z is the rod's first tangent", "`[1, 0, 0, 0]`"),
+        ("`[world] gravity`", "world frame [m/s^2]", "`[0, 0, -9.81]`"),
+        ("`[[effect]]`", "`name` and the parameters of an effect (see Effects)", ""),
+    ]
+    text += ["## Base, world and effects", rows(("key", "meaning", "default"), others)]
+    text += ["## [sensor]", rows(("key", "meaning"), [(f"`{k}`", v) for k, v in SENSOR.items()])]
+    targets = [(f'`"segment.*.{k}"`', unit) for k, unit in SEGMENT_UNITS.items()]
+    targets += [(f'`"tendon.*.{k}"`', unit or "1") for k, unit in TENDON_UNITS.items()]
+    targets += [('`"segment.1.lump.1.mass"`', "kg")] + [
+        (f'`"material.{k}"`', "factor, or fraction") for k in OF_ALL
+    ]
+    text += [
+        "## [fit]",
+        "What is not known exactly, with the standard deviation of its prior. `*` stands for",
+    ]
+    text += [
+        "every segment or tendon; a number names one, from 1 on; `shared = true` fits one number for all."
+    ]
+    text += ["```toml", "[fit]", '"segment.1.length" = { sd = 0.01 }', "```"]
+    text += [rows(("target", "unit of sd"), targets)]
+    write("robot-file.md", "\n\n".join(text).replace("\n\nevery segment", "\nevery segment"))
+
+
+def run_log() -> None:
+    """Every column of a run log, and how a file of one's own is translated."""
+    from fastrod.model.logformat import COLUMNS, UNITS
+
+    text = [
+        "# Run log",
+        "A run log is a CSV or Parquet file with these columns, in SI. Your own file needs no",
+    ]
+    text[1] += " converter: `[log]` of the robot file says what stands where."
+    text += [rows(("column", "meaning"), [(f"`{k}`", v) for k, v in COLUMNS.items()])]
+    text += ["## Units of your own file"]
+    text += [
+        rows(("kind", "units"), [(kind, ", ".join(f"`{u}`" for u in known)) for kind, known in UNITS.items()])
+    ]
+    text += ["```toml", "[log]", 'columns.t = "time_ms"', 'columns.dl = ["m1_deg", "m2_deg", "m3_deg"]']
+    text += ['columns.tip = ["X", "Y", "Z"]', 'units = { time = "ms", angle = "deg", length = "mm" }']
+    text += ["drum_radius = 0.012", "sign = -1", "```"]
+    body = "\n\n".join(text[:-8]) + "\n\n" + "\n".join(text[-8:])
+    write("run-log.md", body)
+
+
+def effects() -> None:
+    """A page for every effect: its law, its parameters, what shows it, and what it does to the tip."""
+    from fastrod.effects.base import effect_names, get_effect, trait
+    from fastrod.identification.report.wording import law, words
+
+    listed = []
+    for name in sorted(effect_names()):
+        what = get_effect(name)
+        first = (inspect.getdoc(type(what)) or "").partition("\n\n")[0].replace("\n", " ")
+        listed.append((f"[{words(name)}](effects/{name}.md)", first, what.seam.name.lower()))
+        text = [f"# {words(name).capitalize()}", first]
+        text += [f"**{key}.** {value}" for key, value in law(name).items()]
+        parameters = [
+            (f"`{p.name}`", p.unit or "1", f"{p.neutral:g}", f"{p.bounds[0]:g} to {p.bounds[1]:g}", p.per)
+            for p in what.parameters
+        ]
+        text += ["## In a robot file", _example(name)]
+        text += [rows(("parameter", "unit", "without effect", "range", "one for each"), parameters)]
+        if any(p.of for p in what.parameters):
+            text += ["Ranges of lengths are multiples of the tendon's offset."]
+        shown = trait(what, "excited_by")
+        text += ["## In a log", f"Motion that shows it: {shown}." if shown else ""]
+        alike = trait(what, "confounded_with")
+        apart = trait(what, "separated_by")
+        if alike:
+            body = [
+                (
+                    f"[{words(other)}]({other}.md)",
+                    apart.get(other) or trait(get_effect(other), "separated_by").get(name, ""),
+                )
+                for other in alike
+            ]
+            text += [rows(("alike in many logs", "run that separates them"), body)]
+        if also := trait(what, "synonyms"):
+            text += [f"Other names: {', '.join(f'`{each}`' for each in also)}."]
+        if picture := signature(name):
+            text += [f"![Motion of the tip by {words(name)} over one bend that swings]({name}.svg)"]
+            with mkdocs_gen_files.open(f"effects/{name}.svg", "w") as file:
+                file.write(picture)
+        write(f"effects/{name}.md", "\n\n".join(filter(None, text)))
+    head = (
+        "# Effects\n\nWhat a real robot does and an ideal model does not. `fastrod identify` tries each.\n\n"
+    )
+    write("effects.md", head + rows(("effect", "", "seam"), listed))
+
+
+def _example(name: str) -> str:
+    """An effect in a robot file, at the numbers where a fit begins."""
+    from fastrod import load_robot
+    from fastrod.effects.base import get_effect
+    from fastrod.model.routing import route
+
+    every = [p.on(route(load_robot("tdcr_b"))) for p in get_effect(name).parameters]
+    lines = [f"{p.name} = {p.starts[0]:.2g}{f'  # {p.unit}' if p.unit else ''}" for p in every]
+    return "\n".join(["```toml", "[[effect]]", f'name = "{name}"', *lines, "```"])
+
+
+def signature(name: str) -> str:
+    """How an effect of typical size moves the tip while one bend swings to and fro, as SVG; empty where it
+    does nothing then."""
+    from fastrod import load_robot
+    from fastrod.errors import FastrodError
+    from fastrod.identification.log.unknowns import known_model
+    from fastrod.identification.report import signature as found
+    from fastrod.logs.runlog import RunLog
+    from fastrod.model.routing import route
+
+    robot = load_robot("tdcr_b")
+    swing = 0.8 * np.sin(np.linspace(0.0, 12.0, 120))
+    bend = np.zeros((120, robot.n_segments, 2))
+    bend[:, :, 1] = swing[:, None]
+    dl = route(robot).tendon_change(bend)
+    log = RunLog(
+        name="", t=np.linspace(0, 12, 120), run=np.full(120, ""), dl=dl, tip_position=np.zeros((120, 3))
+    )
+    try:
+        model = known_model(robot).with_effect(name)
+        state: Any = SimpleNamespace(model=model, theta=model.start)
+        made = found.signatures(name, state, [], log)
+    except FastrodError:
+        return ""
+    if not made or np.abs(made[0].shift).max() < 1e-6:
+        return ""
+    mpl.use("svg")
+    import matplotlib.pyplot as plt
+
+    with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": "fastrod", "font.size": 9}):
+        figure, axes = plt.subplots(figsize=(5.0, 2.8), layout="constrained")
+        axes.plot(made[0].signal, 1e3 * made[0].shift, color="#3a6ea5", linewidth=1.4)
+        axes.axhline(0.0, color="#999", linewidth=0.6)
+        axes.set(xlabel=made[0].signal_label, ylabel=f"{made[0].shift_label} [mm]")
+        axes.spines[["top", "right"]].set_visible(False)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None}, facecolor="white")
+        plt.close(figure)
+    return text.getvalue()
+
+
+def commands() -> None:
+    """Every command with its options."""
+    from fastrod.commands.arguments import build
+
+    parser, _ = build()
+    (group,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    text = ["# Commands"]
+    helps = {action.dest: action.help or "" for action in group._choices_actions}
+    for name, command in group.choices.items():
+        text += [f"## fastrod {name}", f"{helps.get(name, '').capitalize()}."]
+        options = _options(command)
+        for action in command._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for inner, each in action.choices.items():
+                    options += [(f"{inner} {flag}", what) for flag, what in _options(each)]
+        text += [rows(("option", "meaning"), options)]
+    write("commands.md", "\n\n".join(text))
+
+
+def _options(command: argparse.ArgumentParser) -> list[tuple[str, str]]:
+    made = []
+    for action in command._actions:
+        if action.dest == "help" or isinstance(action, argparse._SubParsersAction):
+            continue
+        name = ", ".join(action.option_strings) or str(action.metavar or action.dest)
+        value = f" {action.metavar}" if action.option_strings and action.metavar else ""
+        made.append((f"`{name}{value}`", action.help or ""))
+    return made
+
+
+def environments() -> None:
+    """The table of all environments, below their page."""
+    from fastrod_envs.describe import describe
+    from fastrod_envs.registration import names
+
+    text = [(ROOT / "gym_envs/README.md").read_text("utf-8"), "## Every environment"]
+    for name in names():
+        page = describe(name, timed=False)
+        text += [f"### {name}", "```text", page, "```"]
+    body = "\n\n".join(text).replace("```text\n\n", "```text\n").replace("\n\n```", "\n```")
+    body = re.sub(r"\]\(\.\./([^)#\s]+)", lambda m: f"]({PAGES[m[1]]}", body)
+    write("environments.md", body)
+
+
+def api() -> None:
+    """Every public name."""
+    text = ["# API", "Names are imported from the package that heads their section."]
+    for package, purpose in API.items():
+        module = importlib.import_module(package)
+        text += [f"## {package}: {purpose}"]
+        for name in getattr(module, "__all__", None) or [
+            n for n in vars(module) if n[0].islower() and _own(module, n)
+        ]:
+            thing = getattr(module, name)
+            place = f"{package}.{name}" if inspect.ismodule(thing) else _place(thing, f"{package}.{name}")
+            text += [f"::: {place}", "    options:", "      heading_level: 3", ""]
+    text += ["## fastrod.effects.base: an effect of your own"]
+    for name in LAWS:
+        text += [f"::: fastrod.effects.base.{name}", "    options:", "      heading_level: 3", ""]
+    write("api.md", "\n".join(text))
+
+
+def _own(module: Any, name: str) -> bool:
+    return getattr(vars(module)[name], "__module__", None) == module.__name__
+
+
+def _place(thing: Any, name: str) -> str:
+    module, qualified = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+    return f"{module}.{qualified}" if module and qualified and module.startswith("fastrod") else name
+
+
+def errors() -> None:
+    """Every exception and problem, and what to do."""
+    from fastrod import errors as every
+
+    kinds = [k for k in vars(every).values() if inspect.isclass(k) and issubclass(k, every.FastrodError)]
+    body = [
+        (f"`{k.__name__}`", inspect.getdoc(k).partition("\n")[0], TODO.get(k.__name__, "")) for k in kinds
+    ]
+    problems = [
+        (f"`{p.name}`", text) for p, text in zip(every.Problem, _after_members(every.Problem), strict=True)
+    ]
+    text = [
+        "# Errors and what to do",
+        "Each is one sentence: what was given, what would be right, the nearest name.",
+    ]
+    text += [rows(("error", "meaning", "what to do"), body), "## One robot of a batch"]
+    text += [
+        "A robot that fails does not stop the others: `state.ok` is false, and `state.problems` says why."
+    ]
+    write("errors.md", "\n\n".join([*text, rows(("problem", "meaning"), problems)]))
+
+
+def _after_members(kind: type) -> list[str]:
+    (body,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(body, ast.ClassDef)
+    texts = [
+        n.value.value for n in body.body if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)
+    ]
+    return [" ".join(str(text).split()) for text in texts[1:]]
+
+
+def citation() -> None:
+    """CITATION.cff as it is."""
+    text = (ROOT / "CITATION.cff").read_text("utf-8")
+    write("citation.md", f"# Citation\n\n`CITATION.cff` in the source:\n\n```yaml\n{text}```\n")
+
+
+for source, place in PAGES.items():
+    copied(source, place)
+for make in (robot_file, run_log, effects, commands, environments, api, errors, citation):
+    make()
