@@ -6,7 +6,6 @@ from fastrod.errors import Problem
 from fastrod.loading import load_robot
 from fastrod.model.robot import Lump, Robot, Segment, Tendon
 from fastrod.model.robotfile import robot_names, save_robot
-from fastrod.moved import refuse_old_names
 
 if TYPE_CHECKING:
     from fastrod import reference
@@ -65,8 +64,6 @@ _HOME = {
     "view": "fastrod_viewer.live",
     "write_log": "fastrod.logs.runlog",
 }
-
-refuse_old_names()
 
 
 def __getattr__(name: str) -> Any:

@@ -53,7 +53,6 @@ class Simulator(Motions):
     array([ True,  True])
     """
 
-    @options.renamed_options(hold_gain="kept_jacobian_tolerance")
     @named_inputs
     def __init__(
         self,

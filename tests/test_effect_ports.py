@@ -15,7 +15,6 @@ from fastrod import Robot, Simulator
 from fastrod.effects import base
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
-from fastrod.errors import EffectError
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats
 
@@ -147,14 +146,3 @@ def test_a_mount_that_gives_is_a_base_that_moves() -> None:
     stiff, twin = (Simulator(r, dt=0.01) for r in (having(robot, name="mount"), robot))
     for _ in range(2):
         same(stiff.settle(lengths, tip_force=force), twin.settle(lengths, tip_force=force))
-
-
-def test_old_names_of_ports_are_refused_with_the_new() -> None:
-    ports = object.__new__(EffectPorts)
-    for old, new in (("wiring", "routing"), ("shift_wires", "shift_tendons")):
-        with pytest.raises(AttributeError, match=f"ports have no '{old}' any more; it is '{new}'"):
-            getattr(ports, old)
-    with pytest.raises(AttributeError, match="ports have no 'tip'"):
-        ports.tip  # noqa: B018
-    with pytest.raises(EffectError, match=r"is of 'reach'; it must be .* \('reach' is called 'offset' now\)"):
-        Parameter("play", "m", of="reach")

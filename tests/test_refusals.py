@@ -194,10 +194,6 @@ SIMULATORS: Rows = [
     (lambda: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**30), "would take"),
-    (
-        lambda: Simulator(REACHER, hold_gain=1e-4),
-        r"^the option 'hold_gain' is now 'kept_jacobian_tolerance'\.$",
-    ),
     (lambda: Simulator(rod(), kept_jacobian_tolerance=-1e-9), "kept_jacobian_tolerance"),
     (lambda: Simulator(rod(), kept_jacobian_tolerance=np.inf), "kept_jacobian_tolerance"),
     (lambda: Simulator(rod(), kept_jacobian_tolerance=np.nan), "kept_jacobian_tolerance"),
@@ -459,10 +455,6 @@ OTHERS: Rows = [
     ),
     (lambda: scene(rod_friction=-1.0), "rod_friction is -1.0; it must be zero or positive"),
     (lambda: scene(max_contacts=65), "max_contacts is 65; it must be a whole number from 1 to 64"),
-    (
-        lambda: scene(max_passes=60),
-        r"max_passes is now max_iterations; give ContactScene\(max_iterations=60\)",
-    ),
     (lambda: scene(max_iterations=3), "max_iterations is 3; it must be a whole number, at least 20"),
     (lambda: scene(watch=0.5), "watch is 0.5; it is a fraction of the rod's length"),
     (lambda: scene(mounting=-0.1), "mounting is -0.1 m; it must be zero or positive"),

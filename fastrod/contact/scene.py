@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -54,15 +54,8 @@ class ContactScene:
     """Who measures distances to meshes, with the same loads: "bvh", a compiled search for batches; "fcl",
     FCL, one query at a time; "auto" is the cheaper one, which is "bvh" from one robot on (`fastrod bench
     contact`)."""
-    max_passes: InitVar[int | None] = None
-    """The old name of `max_iterations`, which is refused."""
 
-    def __post_init__(self, max_passes: int | None) -> None:
-        if max_passes is not None:
-            raise InputError(
-                "ContactScene.max_passes is now max_iterations; give "
-                f"ContactScene(max_iterations={shown(max_passes)}) instead."
-            )
+    def __post_init__(self) -> None:
         obstacles = (self.obstacles,) if isinstance(self.obstacles, Obstacle) else tuple(self.obstacles)
         object.__setattr__(self, "obstacles", obstacles)
         for o in obstacles:

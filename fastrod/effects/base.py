@@ -105,10 +105,9 @@ class Parameter:
             )
         given: str = self.of  # a law of somebody's package may say anything
         if given not in get_args(Of):
-            old = " ('reach' is called 'offset' now)" if given == "reach" else ""
             raise EffectError(
                 f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length', '1/offset', "
-                f"'1/offset^2' or ''{old}."
+                "'1/offset^2' or ''."
             )
         if self.typical is None:
             span = 0.1 * (high - low)

@@ -114,11 +114,6 @@ class EffectPorts:
             }
         )
 
-    def __getattr__(self, name: str) -> Any:
-        if name in (old := {"wiring": "routing", "shift_wires": "shift_tendons"}):
-            raise AttributeError(f"ports have no {name!r} any more; it is {old[name]!r}.")
-        raise AttributeError(f"ports have no {name!r}.")
-
     @property
     def dl(self) -> Floats:
         """(n, n_tendons) tendon lengths against the straight rest robot [m], a new array."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from sys import float_info
 from typing import Any, Literal, ParamSpec, TypeVar
 
@@ -24,21 +23,6 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _USUAL = "generalized_alpha", 0.5  # scheme and rho of a simulator that is given none
 _MOST_PIECES = 16
-
-
-def renamed_options(**now: str) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Old keyword -> the new one: a call with an old one raises `InputError`."""
-
-    def around(function: Callable[_P, _R]) -> Callable[_P, _R]:
-        @functools.wraps(function)
-        def checked(*args: _P.args, **options: _P.kwargs) -> _R:
-            for old in now.keys() & options.keys():
-                raise InputError(f"the option {old!r} is now {now[old]!r}.")
-            return function(*args, **options)
-
-        return checked
-
-    return around
 
 
 def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:

@@ -23,7 +23,7 @@ FRAMES = 1500
 """Most rows of a log whose whole shape is kept."""
 POINTS_PER_SEGMENT = 20
 BEFORE = "base model, its own parameters fitted"
-SWITCHED_OFF = "the same model, its effects switched off"
+SWITCHED_OFF = "model without its effects"
 _LONG = 30.0  # usual steps: a longer pause is closed up
 _EVERY_FOURTH = "every fourth of "  # how a report says that nobody named what is held out
 

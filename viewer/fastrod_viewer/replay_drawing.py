@@ -58,7 +58,7 @@ class ReplayDrawing:
             Entry("residual, from the predicted tip", CONTACT),
         ]
         if len(self.playback.tracks) > 1:
-            entries.append(Entry("the other model", GHOST))
+            entries.append(Entry("the model before", GHOST))
         return Legend("Measured beside predicted", "", tuple(entries)).html()
 
     def forget(self) -> None:

@@ -62,8 +62,8 @@ class Friction(Operator):
     }
     synonyms = ("hysteresis", "coulomb_friction", "capstan")
     separated_by: ClassVar[Mapping[str, str]] = {
-        "backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is as wide "
-        "at every bend",
+        "backlash": "slow reversals of many sizes, the smallest under three times the backlash: backlash has "
+        "the same width everywhere, friction does not",
         "creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction stays, "
         "creep decays",
         "plastic_set": "small loops after a large one: friction shows in each, a set only after a new "

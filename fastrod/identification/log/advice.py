@@ -49,7 +49,8 @@ def why_unknown(name: str, samples: LogSamples, robot: Robot) -> str:
     log = samples.log
     if "stiffness" in name and not loaded(samples, robot):
         return (
-            "no known load in this log: with prescribed lengths the shape is geometry, whatever the stiffness"
+            "this log has no known load, so tendon lengths alone fix the shape and stiffness cannot be "
+            "estimated"
         )
     if "stiffness" in name:
         return "the known loads in this log bend the robot too little to show it"

@@ -218,7 +218,7 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
         )
         if periods < _PERIODS:  # as many other laws look
             name = "wave"
-            what = f"a wave over {periods:.2g} of whose periods the tendons move: too few to name a cause"
+            what = f"a wave of which the log covers {periods:.2g} periods, too few to name a cause"
         yield AlternativePattern(name, "static", what, _weighted(linearised, np.stack(blocks, axis=-1)), 1)
 
 

@@ -21,7 +21,7 @@ SEEN = 0.05
 
 @final
 class ReachObstacle(ReachTask):
-    """Reach (which see: robot, goals, actions) around a bar of 0.4 x 0.02 x 0.02 m along x at (0, 0.06, 0.35)
+    """Like Reach, with a bar in the way: one of 0.4 x 0.02 x 0.02 m along x at (0, 0.06, 0.35)
     m.
 
     Reward: that of Reach, but -1 alone in the step in which the robot touches the bar; that ends the episode,
