@@ -103,6 +103,7 @@ def test_sessions_and_positions_are_read_as_they_were_written(tmp_path: Path) ->
             assert np.array_equal(np.asarray(one), np.asarray(other))
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("gain", [1.0, 0.75])
 def test_a_robot_is_moved_by_what_its_drives_did_and_not_by_their_commands(gain: float) -> None:
     """Positions are read 0.2 s late, whatever the model's own delay."""
