@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import gzip
+import html
 import io
 import ipaddress
 import logging
+import re
 import secrets
 import socket
 import sys
@@ -64,6 +67,8 @@ class Access:
         self.key = secrets.token_urlsafe()
         """First element of the path; new with every server."""
         name = socket.gethostname() if _every(host) else host  # `elsewhere` prints it without a route
+        self.title = ""
+        """Of the page, in the browser's tab; empty: viser's own."""
         self._names = (f"[{name}]" if ":" in name else name.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
@@ -103,6 +108,7 @@ class Access:
             without = request.path.removeprefix(f"/{self.key}") or "/"
             response = plain(connection, replace(request, path=without))
             if response is not None:
+                _set_title(response, self.title)
                 response.headers["Referrer-Policy"] = (
                     "no-referrer"  # a link must not reveal the page's address
                 )
@@ -110,6 +116,19 @@ class Access:
             return response
 
         return answer
+
+
+def _set_title(response: Response, title: str) -> None:
+    """Give a page that viser serves another title, where it is a page."""
+    packed = response.headers.get("Content-Encoding", "") == "gzip"
+    if not title or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return
+    body = gzip.decompress(response.body) if packed else response.body
+    new = f"<title>{html.escape(title)}</title>".encode()
+    body = re.sub(rb"<title>[^<]*</title>", lambda _: new, body, count=1)
+    response.body = gzip.compress(body) if packed else body
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
 
 
 @final
@@ -146,11 +165,16 @@ class Served:
     viser: viser.ViserServer
     host: str
     """That it is bound to."""
-    key: str
-    """First element of every path."""
+    access: Access
+    """Whose key is the first element of every path."""
     ignored: Ignored
     """Hears of messages that make no sense."""
     _closing: contextlib.ExitStack = field(default_factory=contextlib.ExitStack, init=False, repr=False)
+
+    @property
+    def key(self) -> str:
+        """First element of every path."""
+        return self.access.key
 
     @property
     def address(self) -> str:
@@ -209,7 +233,7 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
             server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         finally:
             setattr(web, "serve", plain)  # noqa: B010
-    served = Served(viser=server, host=host, key=access.key, ignored=ignored)
+    served = Served(viser=server, host=host, access=access, ignored=ignored)
     if not guarded.is_set():
         served.stop()
         found = viser.__version__

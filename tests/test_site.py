@@ -45,8 +45,9 @@ def test_site_has_every_name(site: Path) -> None:
         "robot-file": [f.name for kind in (Segment, Tendon, Lump, LogFormat) for f in fields(kind)],
         "run-log": list(COLUMNS),
         "effects": [name.replace("_", " ") for name in effect_names()],
-        "errors": [kind.__name__ for kind in FastrodError.__subclasses__()] + [p.name for p in Problem],
+        "errors": [*(kind.__name__ for kind in FastrodError.__subclasses__()), *(p.name for p in Problem)],
     }
+    names["errors"] += ["SceneError", "DeviceError", "CalibrationError"]
     names["robot-file"] += [*SENSOR, *(f"segment.*.{k}" for k in SEGMENT_UNITS)]
     names["robot-file"] += [f"tendon.*.{k}" for k in TENDON_UNITS] + [f"material.{k}" for k in MATERIAL]
     (group,) = [a for a in build()[0]._actions if isinstance(a, argparse._SubParsersAction)]

@@ -212,7 +212,7 @@ def _view(arguments: argparse.Namespace) -> int:
         n_robots=arguments.robots,
         host=arguments.host,
         open_browser=not arguments.no_open,
-        script=arguments.play,
+        script=arguments.play or (arguments.what is None and not arguments.dynamics),
         server=server,
         dynamics=arguments.dynamics,
         line_density=arguments.line_density,

@@ -77,6 +77,9 @@ TODO = {
     "LogError": "Run `fastrod check LOG --robot R`: it names units, signs, order and clock.",
     "HostError": "Look the body or link up by the name that the engine gives it.",
     "EffectError": "Compare the effect's parameters with its page under Effects.",
+    "SceneError": "A scene's own check failed: its sentence has the figure and its limit.",
+    "DeviceError": "Follow its sentence: it names the drive, the object and what it reported.",
+    "CalibrationError": "Take more pictures of the board, in the corners and at other angles.",
     "UnknownNameError": "Take the nearest name that it gives, or one of those it lists.",
 }
 
@@ -392,7 +395,9 @@ def errors() -> None:
     """Every exception and problem, and what to do."""
     from fastrod import errors as every
 
-    kinds = [k for k in vars(every).values() if inspect.isclass(k) and issubclass(k, every.FastrodError)]
+    for module in ("fastrod_scenes.scene", "fastrod_device.errors"):
+        importlib.import_module(module)
+    kinds = [every.FastrodError, *every.FastrodError.__subclasses__()]
     body = [
         (f"`{k.__name__}`", inspect.getdoc(k).partition("\n")[0], TODO.get(k.__name__, "")) for k in kinds
     ]

@@ -22,7 +22,7 @@ from fastrod_viewer.catalogue import catalogue, open_world
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.holder import Holder
 from fastrod_viewer.holder_panel import HolderPanels
-from fastrod_viewer.page import ViewerPage, is_upright, notify
+from fastrod_viewer.page import ViewerPage, is_upright, notify, plain
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage
 from fastrod_viewer.server import serve
@@ -113,6 +113,7 @@ class App:
                     link=link,
                     script=script,
                 )
+            self.served.access.title = f"fastrod · {plain(self.page.title)}"
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
             self._picker.disabled = link is not None  # another scene would let go of the robot
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, final
 
@@ -82,12 +82,14 @@ class ControlPanel:
             drag = "" if world.ringing is None else "Drag its tip and let go, or load it: tab *Loads*."
             gui.add_markdown(f"This robot has no tendons. {drag or 'Load its tip instead: tab *Loads*.'}")
         groups = drive_controls(world, teleop)
-        for group in [group for group in groups if not group.title or group.title.startswith("Segment")]:
+        own = [group for group in groups if group.title.startswith("Segment")]
+        others = [group for group in groups if group.title and group not in own]
+        for group in [group for group in groups if not group.title]:
             self._add(group)
+        self._together("Each segment", own)
         if teleop.actions is not None:
             self._button("Straight pose", teleop.all_zero)
-        for group in [group for group in groups if group.title and not group.title.startswith("Segment")]:
-            self._add(group)
+        self._together(" and ".join(group.title.lower() for group in others).capitalize(), others)
         if world.robot.n_tendons:
             most = self._fastest()
             now = min(most, max(5, 5 * round(math.degrees(self.teleop.speeds.bend) / 5)))
@@ -122,6 +124,16 @@ class ControlPanel:
         world = self.session.world
         self._add(load_controls(world.robot, self.teleop, rings=world.ringing is not None))
         self._button("No loads", lambda: self.teleop.load(tip_force=np.zeros(3), payload=0.0, gravity=1.0))
+
+    def _together(self, title: str, groups: Sequence[Group]) -> None:
+        """Groups in one that is closed, where there are several: an empty box for each says nothing."""
+        if len(groups) < 2:
+            for group in groups:
+                self._add(group)
+            return
+        with self.server.gui.add_folder(title, expand_by_default=False):
+            for group in groups:
+                self._add(group)
 
     def _add(self, group: Group) -> None:
         gui = self.server.gui

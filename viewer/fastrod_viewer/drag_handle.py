@@ -45,8 +45,9 @@ class DragHandle:
             cast_shadow=False,
             receive_shadow=False,
         )
+        # of a robot that moves by itself the page's heading says it: a label would follow it about
         self._hint: Any = server.scene.add_label(
-            "/drag_handle/hint", _HINT, position=(0.0, 0.0, 2.2 * radius)
+            "/drag_handle/hint", "" if session.scripted else _HINT, position=(0.0, 0.0, 2.2 * radius)
         )
         self._ball.on_drag("left")(self._dragged)
 

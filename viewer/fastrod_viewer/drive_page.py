@@ -21,7 +21,19 @@ from fastrod_viewer.drawing import Drawing
 from fastrod_viewer.export import wrap
 from fastrod_viewer.linked import Linked
 from fastrod_viewer.options import FINE, ViewOptions
-from fastrod_viewer.page import PageView, ViewerPage, facts, notify, picture, save_name, send, stand_back
+from fastrod_viewer.page import (
+    PageView,
+    ViewerPage,
+    facts,
+    heading,
+    millimetres,
+    notify,
+    picture,
+    plain,
+    save_name,
+    send,
+    stand_back,
+)
 from fastrod_viewer.session import Session, ViewFrame
 from fastrod_viewer.teleop import Speeds, Teleop
 from fastrod_viewer.world import World
@@ -171,6 +183,7 @@ class DrivePage(ViewerPage):
         gui, session = self.server.gui, self.session
         self.panel = gui.add_folder(None)
         with self.panel:
+            gui.add_html(heading(plain(self.title), self.world.about, self._hint()))
             self.stop = gui.add_button(
                 "STOP",
                 color="red",
@@ -227,6 +240,14 @@ class DrivePage(ViewerPage):
             if (n := min(self.world.robot.n_segments, 9)) > 1:
                 keys += f" · <kbd>1</kbd>–<kbd>{n}</kbd> segment that keys bend"
         return f"<small>{keys}</small>"
+
+    def _hint(self) -> str:
+        """What to try, in a sentence."""
+        if self.world.ringing is not None:
+            return "Pull the ball at its tip, and let go."
+        if self._can_drag():
+            return "Drag the ball at its tip, or move a slider."
+        return "" if self.world.drivable else "It plays by itself."
 
     def _slow_motion(self) -> None:
         """A choice of how fast the world's time goes, beside the clock of the wall."""
@@ -360,8 +381,7 @@ class DrivePage(ViewerPage):
         if frame.measured is not None and np.isfinite(frame.measured.tip_position).all():
             state = self.world.rods[0].state
             model = state.rotation[0, 0].T @ (state.tip_position[0] - state.position[0, 0])
-            x, y, z = (1e3 * frame.measured.tip_position).tolist()
-            rows.append(("Measured tip", f"{x:.1f}, {y:.1f}, {z:.1f} mm"))
+            rows.append(("Measured tip", millimetres(frame.measured.tip_position)))
             rows.append(
                 ("Measured − model", f"{1e3 * np.linalg.norm(frame.measured.tip_position - model):.2f} mm")
             )
@@ -414,8 +434,7 @@ class DrivePage(ViewerPage):
         return frame.problem and f"{frame.problem} Reset begins anew.", ""
 
     def _tip(self) -> str:
-        x, y, z = (1e3 * self.world.rods[0].state.tip_position[0]).tolist()
-        return f"{x:.1f}, {y:.1f}, {z:.1f} mm"
+        return millimetres(self.world.rods[0].state.tip_position[0])
 
 
 def fitted(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -98,6 +98,30 @@ def picture(client: Any) -> bytes:
     return out.getvalue()
 
 
+def plain(name: str) -> str:
+    """A name as one reads it.
+
+    >>> plain("five_segment_reacher")
+    'Five segment reacher'
+    """
+    words = name.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def heading(title: str, about: str, hint: str) -> str:
+    """HTML of what is seen, and of what to try."""
+    return (
+        f'<div style="padding:2px 9px 6px">'
+        f'<div style="font-size:15px;font-weight:600">{html.escape(title)}</div>'
+        f'<div style="font-size:12.5px;color:#4b5563">{html.escape(f"{about} {hint}".strip())}</div></div>'
+    )
+
+
+def millimetres(place: Floats) -> str:
+    """(3,) [m] as text, without a minus before a zero."""
+    return ", ".join(f"{round(1e3 * x, 1) + 0.0:.1f}" for x in np.asarray(place).tolist()) + " mm"
+
+
 def facts(rows: Sequence[tuple[str, str]], problem: str = "", *, news: str = "") -> str:
     """HTML of names and values in two columns, and below them what is wrong, or worth knowing."""
     cells = "".join(
