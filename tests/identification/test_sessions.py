@@ -76,6 +76,7 @@ def test_days_share_the_robot_and_have_zeros_camera_and_clock_of_their_own() -> 
     assert any("session 'june' has its camera" in note for note in result.notes)
 
 
+@pytest.mark.study
 def test_another_day_alone_is_fitted_to_a_robot_that_is_known() -> None:
     june = logs()[1]
     result = identify(june, one_segment(effects=(WORN,)), only_session=True, held_out=["@6:"])
