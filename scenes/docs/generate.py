@@ -31,6 +31,7 @@ PAGES = {
     "gym_envs/README.md": "environments.md",
     "viewer/README.md": "viewer.md",
     "viewer/film.gif": "film.gif",
+    "viewer/first_page.png": "first_page.png",
     "device/README.md": "prototype.md",
     "scenes/README.md": "scenes.md",
     "perf/README.md": "figures.md",

@@ -223,7 +223,7 @@ class DrivePage(ViewerPage):
             window = gui.add_panel()
             with window.add_tab("Camera in hand" if far is None else "Camera", viser.Icon.CAMERA):
                 self.camera = window, gui.add_image(fitted(_NOTHING if seen is None else seen), format="jpeg")
-            window.float(x=-15, y=15, width=340 if far is None else 290)
+            window.float(x=-15, y=15, width=240 if far is None else 290)
 
     def _seen(self) -> NDArray[np.uint8] | None:
         far = self.session.far
