@@ -37,6 +37,7 @@ ALSO = {
     "hosts": "from fastrod.hosts import connect; world = connect(dt=0.01); world.stepSimulation()",
     "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
     "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
+    "ros": "import rosbags; from fastrod.logs.bag import read_bag",
     "cuda": "from fastrod.solver.gpu import device",
     "network": "from fastrod.identification.learned import network; import sklearn",
 }

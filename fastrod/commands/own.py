@@ -131,7 +131,9 @@ def add_commands(commands: argparse._SubParsersAction[Any]) -> None:
         "--pieces", type=int, metavar="N", help="of a segment (default: 16, 24 of three and more)"
     )
 
-    brings = commands.add_parser("import", help="your own log file as a run log: CSV, Parquet, MATLAB")
+    brings = commands.add_parser(
+        "import", help="your own log file as a run log: CSV, Parquet, MATLAB, ROS 2 bag"
+    )
     check = commands.add_parser("check", help="is this a log of this robot, and what can it reveal?")
     for command in (brings, check):
         command.add_argument("log", type=Path, metavar="LOG", help="a file that [log] of the robot describes")

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fastrod.errors import LogError
+from fastrod.logs.bag import read_bag
 from fastrod.types import Floats
 
 Table: TypeAlias = dict[str, Sequence[str] | Floats]
@@ -22,12 +23,15 @@ _MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000
 
 
 def read_table(path: str | Path) -> Table:
-    """The columns of a .csv, .parquet or .mat by name, not interpreted: texts of a CSV, numbers elsewhere.
+    """The columns of a .csv, .parquet or .mat, or of a ROS 2 bag, by name, not interpreted: texts of a CSV,
+    numbers elsewhere.
 
     Raises `LogError` for a file that is not there, is empty, or whose rows do not fit its header.
     """
     path = Path(path)
     try:
+        if (path / "metadata.yaml").is_file() or path.suffix in (".mcap", ".db3"):
+            return dict(read_bag(path, _MOST_BYTES))
         if path.exists() and not path.is_file():  # a pipe or a device may have no end
             raise ValueError("it is no file")
         return _READERS.get(path.suffix.lower(), _read_csv)(path)
@@ -201,7 +205,7 @@ def _read_mat(path: Path) -> Table:
         raise LogError(f"{path.name} is a MATLAB file of version 7.3; save it with -v7.") from error
     except LogError:
         raise
-    except Exception as error:  # noqa: BLE001: of a damaged file scipy raises anything
+    except Exception as error:  # of a damaged file scipy raises anything
         raise LogError(f"{path.name} is not a MATLAB file: {str(error).rstrip('.')}.") from error
     every = {name: array for name, array in content.items() if not name.startswith("__")}
     for name, array in list(every.items()):
