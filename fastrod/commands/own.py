@@ -141,6 +141,10 @@ def add_commands(commands: argparse._SubParsersAction[Any]) -> None:
     brings.add_argument(
         "--out", type=Path, metavar="FILE", help="run log, .csv or .parquet (default: LOG_run.csv)"
     )
+    brings.add_argument(
+        "--lerobot", type=Path, metavar="DIR", help="write a data set of LeRobot (v2.1), an episode a run"
+    )
+    brings.add_argument("--fps", type=int, default=30, metavar="N", help="with it, its rate (default: 30)")
     check.add_argument(
         "--out",
         type=Path,
@@ -187,6 +191,13 @@ def bring(arguments: argparse.Namespace) -> int:
     from fastrod.logs.runlog import read_log, write_log
 
     robot = load_robot(arguments.robot)
+    if arguments.lerobot is not None:
+        from fastrod.logs.lerobot import write_lerobot
+
+        log, task = read_log(arguments.log, robot), f"move {robot.name}"
+        made = write_lerobot(log, arguments.lerobot, robot=robot.name, fps=arguments.fps, task=task)
+        print(f"wrote {arguments.lerobot}: {made[0]} episodes, {made[1]} frames")
+        return 0
     if not robot.log.columns:
         raise InputError(
             f"robot {robot.name!r} has no [log] columns, which say what stands where in "
