@@ -505,7 +505,8 @@ class Simulator(Motions):
         """The first robot's `log_points` of the last state, with their offsets from the backbone: world
         (n_robots, k, 3) [m], and world_from_material (n_robots, k, 3, 3) of their cross-sections. On a robot
         that is shortened below a point's arclength, that point is at its tip."""
-        robot, end = self.robots[0], float(np.nanmin(self._full("markers").arclength[:, -1]))
+        robot, ends = self.robots[0], self._full("markers").arclength[:, -1]
+        end = np.min(ends[np.isfinite(ends)], initial=np.inf)
         found = self.shape(np.minimum(np.array(robot.log_points), end))
         offset = np.array(robot.log_offsets or [(0.0, 0.0)] * len(robot.log_points))
         return found.position + np.einsum("nkij,kj->nki", found.rotation[..., :2], offset), found.rotation

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.commands.cli import main
-from fastrod.errors import LogError, RobotError
+from fastrod.errors import FastrodError, LogError, RobotError
 from fastrod.identification.excite import excitation
 from fastrod.logs.runlog import RunLog, read_log, write_log
 from fastrod.model import taper
@@ -127,6 +130,50 @@ def test_pieces_keep_place_of_lumps_and_angles() -> None:
     at = np.cumsum([0.0, *(s.length for s in pieces)])
     ((k, lump),) = [(k, lump) for k, s in enumerate(pieces) for lump in s.lumps]
     assert_allclose(at[k] + lump.at, 0.16)
+
+
+ODD = [
+    0,
+    0.0,
+    -1,
+    1e-300,
+    1e300,
+    10**18,
+    math.nan,
+    math.inf,
+    "",
+    True,
+    [],
+    [0.0],
+    [1, "a"],
+    [0.01, 0.005],
+    {},
+    0.01,
+]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_odd_body_is_a_robot_or_a_sentence(seed: int) -> None:
+    """A hundred files each in which one to three values are of another kind or size."""
+    rng = np.random.default_rng(seed)
+    names = ["length", "body_radius", "youngs_modulus", "poisson", "density", "mode", "tendons", "extension"]
+    for _ in range(100):
+        data = tomllib.loads(text())
+        (segment,) = data["segment"]
+        for _ in range(rng.integers(1, 4)):
+            odd = ODD[rng.integers(len(ODD))]
+            place = rng.integers(4)
+            if place == 0 and segment["tendons"] and isinstance(segment["tendons"], list):
+                if isinstance(segment["tendons"][0], dict):
+                    segment["tendons"][0]["offset" if rng.integers(2) else "angle"] = odd
+            elif place == 1:
+                segment["lumps"] = [{"at": odd, "mass": 0.01}]
+            elif place == 2:
+                data["log"]["point_offsets"] = odd
+            else:
+                segment[names[rng.integers(len(names))]] = odd
+        with contextlib.suppress(FastrodError):
+            loads(tomli_w.dumps(data))
 
 
 # -- the log

@@ -231,7 +231,7 @@ class Segment:
         ):
             if not _number(value):
                 raise RobotError(f"{name} is {value!r}; it must be a number [{unit}].")
-            _positive(name, value, unit)
+            _positive(name, value, unit, *((_SHORTEST, _LONGEST) if unit == "m" else (1.0, _STIFF[1])))
         if not _number(density) or not 0.0 <= density <= _MOST:
             raise RobotError(f"density is {density!r} kg/m^3; it must be zero or positive.")
         if not _number(poisson) or not -1.0 < poisson <= 0.5:

@@ -193,9 +193,11 @@ def _of_material(table: dict[str, Any], where: str) -> dict[str, Any]:
     """The table of a round segment of one material with its stiffness and mass, as `Segment.from_material`;
     what it says itself stands."""
     _check_needed(table, ("length",), where)
-    moduli = {key: table.pop(key) for key in _MATERIAL if key in table}
-    radius = table.pop("body_radius")
-    made = Segment.from_material(length=table["length"], radius=radius, mode="passive", **moduli)
+    moduli = {key: _convert(table.pop(key), key, where, float) for key in _MATERIAL if key in table}
+    given, length = table.pop("body_radius"), _convert(table["length"], "length", where, float)
+    kind: Any = tuple[float, float] if isinstance(given, list) else float
+    radius = _convert(given, "body_radius", where, kind)
+    made = Segment.from_material(length=length, radius=radius, mode="passive", **moduli)
     found = ("bending_stiffness", "torsional_stiffness", "axial_stiffness", "shear_stiffness", "line_density")
     return {**{key: getattr(made, key) for key in found}, "body_radius": made.body_radius, **table}
 

@@ -13,6 +13,8 @@ PIECES = 10
 """Pieces of a segment that tapers, or that a tendon on a cone crosses. A cone of 2.4 : 1 then gives 1.3 % too
 much to a force on its tip; the error falls with the square of their number."""
 
+_THINNEST, _LONGEST = 1e-6, 10.0  # m
+
 
 def in_pieces(tables: Sequence[Any], where: str) -> list[Any]:
     """The `[[segment]]` tables of a robot file; one whose `body_radius` lists two numbers, at its base and at
@@ -29,17 +31,8 @@ def in_pieces(tables: Sequence[Any], where: str) -> list[Any]:
             split |= set(range(k + 1))
     if not split:
         return list(tables)
-    for k, table in enumerate(tables, 1):
-        if not isinstance(radius := _of(table, "body_radius"), list):
-            continue
-        if "youngs_modulus" not in table:
-            raise RobotError(
-                f"{where}: segment {k} tapers, its body_radius has two numbers, and lacks youngs_modulus."
-            )
-        if len(radius) != 2 or not all(isinstance(r, (int, float)) for r in radius):
-            raise RobotError(
-                f"{where}: segment {k}: body_radius is {radius!r}; give one number, or base and end [m]."
-            )
+    for k in sorted(split):
+        _check(tables[k], f"{where}: segment {k + 1}")
     counts = [PIECES if k in split else 1 for k in range(n)]
     made: list[Any] = []
     for k, table in enumerate(tables):
@@ -51,6 +44,27 @@ def in_pieces(tables: Sequence[Any], where: str) -> list[Any]:
             pieces[-1] |= {"tendons": moved} | ({"mode": table["mode"]} if "mode" in table else {})
         made += pieces
     return made
+
+
+def _check(table: Any, where: str) -> None:
+    """Refuse what cannot be divided among pieces; all else is looked at where a segment is made."""
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{where} is {table!r}; it must be a table.")
+    if isinstance(radius := _of(table, "body_radius"), list):
+        if "youngs_modulus" not in table:
+            raise RobotError(f"{where} tapers, its body_radius has two numbers, and lacks youngs_modulus.")
+        if len(radius) != 2 or not all(_is_number(r) and r >= _THINNEST for r in radius):
+            raise RobotError(f"{where}: body_radius is {radius!r}; give one number, or base and end [m].")
+    extension, lumps = table.get("extension", []), table.get("lumps", [])
+    if not isinstance(extension, list) or not all(map(_is_number, extension)):
+        raise RobotError(f"{where}: extension is {extension!r}; give two numbers, smallest and largest [m].")
+    if not isinstance(lumps, list) or not all(_is_number(_of(lump, "at")) for lump in lumps):
+        raise RobotError(f"{where}: lumps must be a list of tables, [ {{at = ..., mass = ...}}, ... ].")
+
+
+def _is_number(value: Any) -> bool:
+    """A length or a place that a robot may have [m]."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _LONGEST
 
 
 def _of(table: Any, key: str) -> Any:
@@ -70,13 +84,15 @@ def _on_cone(tendon: Any, n_crossed: int) -> bool:
 def _pieces(table: Mapping[str, Any], n: int) -> Iterator[dict[str, Any]]:
     """A segment's pieces, without tendons."""
     if n == 1:
-        yield dict(table)
+        yield dict(table) if isinstance(table, Mapping) else table
         return
     radius, length = table.get("body_radius"), table.get("length")
+    if not _is_number(length):
+        length = None
     kept = {key: value for key, value in table.items() if key not in ("tendons", "mode", "lumps")}
     for first, last in pairwise(_edges(radius, n)):
         piece = {**kept, "mode": "passive"}
-        if isinstance(length, (int, float)):  # any other is refused where a segment is made
+        if length is not None:  # any other is refused where a segment is made
             piece["length"] = length * (last - first)
             lumps = [
                 {**lump, "at": max(lump["at"] - first * length, 0.0)}
@@ -94,7 +110,7 @@ def _pieces(table: Mapping[str, Any], n: int) -> Iterator[dict[str, Any]]:
 def _edges(radius: Any, n: int) -> list[float]:
     """Where the pieces of a segment begin and end, of its length: of a cone each is as many times as thin as
     the one before, so that none is much softer at its end than at its base."""
-    if not isinstance(radius, list) or min(radius) <= 0.0 or math.isclose(*radius):
+    if not isinstance(radius, list) or math.isclose(*radius):
         return [i / n for i in range(n + 1)]
     ratio = radius[1] / radius[0]
     return [(ratio ** (i / n) - 1.0) / (ratio - 1.0) for i in range(n)] + [1.0]
@@ -109,6 +125,8 @@ def _along(tendon: Any, counts: Sequence[int], radii: Sequence[Any], where: str)
         if not isinstance(value := made.get(key), list):
             continue
         if key == "offset" and _on_cone(tendon, len(counts)):
+            if not all(map(_is_number, value)):
+                raise RobotError(f"{where}: a tendon's offset is {value!r}; give numbers [m].")
             made[key] = [
                 a + (b - a) * _middle(radius, first, last)
                 for a, b, n, radius in zip(value[:-1], value[1:], counts, radii, strict=True)
