@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tomllib
 from dataclasses import replace
@@ -172,8 +171,13 @@ def test_odd_body_is_a_robot_or_a_sentence(seed: int) -> None:
                 data["log"]["point_offsets"] = odd
             else:
                 segment[names[rng.integers(len(names))]] = odd
-        with contextlib.suppress(FastrodError):
-            loads(tomli_w.dumps(data))
+        said, robot = "", None
+        try:
+            robot = loads(tomli_w.dumps(data))
+        except FastrodError as error:
+            said = str(error)
+        assert (robot is None) == (said.count("\n") == 0 and said != "")
+        assert robot is None or loads(dumps(robot)) == robot
 
 
 # -- the log

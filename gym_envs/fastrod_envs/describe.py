@@ -86,14 +86,14 @@ def _fields(entries: tuple[Field, ...]) -> str:
 
 
 def _options(kind: type[Any]) -> str:
-    docs = {name: text for base in reversed(kind.__mro__) for name, text in _attribute_docs(base).items()}
+    docs = {name: text for base in reversed(kind.__mro__) for name, text in attribute_docs(base).items()}
     return "\n".join(
         f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}"
         for option in dataclasses.fields(kind)
     )
 
 
-def _attribute_docs(kind: type[Any]) -> dict[str, str]:
+def attribute_docs(kind: type[Any]) -> dict[str, str]:
     """The sentences below the attributes of a class, by name."""
     import ast
 

@@ -72,7 +72,7 @@ MATERIAL = {
     "poisson": "with it, Poisson's ratio; left out: 0.3",
     "density": "with it, in place of line_density [kg/m^3]",
 }
-TODO = {
+REMEDIES = {
     "RobotError": "Correct the key that it names; `fastrod new` writes a robot file that works.",
     "InputError": "Compare shape and unit with the sentence; `Simulator.step` lists the inputs.",
     "LogError": "Run `fastrod check LOG --robot R`: it names units, signs, order and clock.",
@@ -116,27 +116,13 @@ def rows(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
-def documented(kind: type) -> dict[str, str]:
-    """The sentences below the fields of a dataclass, by name."""
-    (body,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(body, ast.ClassDef)
-    found: dict[str, str] = {}
-    for one, after in zip(body.body, [*body.body[1:], None], strict=True):
-        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-            text = (
-                after.value.value
-                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-                else ""
-            )
-            found[one.target.id] = " ".join(str(text).split())
-    return found
-
-
 def keys_of(kind: type) -> str:
     """The keys that the fields of a dataclass are in a robot file."""
-    body = []
-    for name, text in documented(kind).items():
-        field = kind.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    from fastrod_envs.describe import attribute_docs
+
+    body, texts = [], attribute_docs(kind)
+    for name, field in kind.__dataclass_fields__.items():  # type: ignore[attr-defined]
+        text = texts.get(name, "")
         default = getattr(field, "default", None)
         plain = "" if "MISSING" in repr(default) else f"`{default!r}`"
         body.append((f"`{name}`", text, plain))
@@ -400,7 +386,7 @@ def errors() -> None:
         importlib.import_module(module)
     kinds = [every.FastrodError, *every.FastrodError.__subclasses__()]
     body = [
-        (f"`{k.__name__}`", inspect.getdoc(k).partition("\n")[0], TODO.get(k.__name__, "")) for k in kinds
+        (f"`{k.__name__}`", inspect.getdoc(k).partition("\n")[0], REMEDIES.get(k.__name__, "")) for k in kinds
     ]
     problems = [
         (f"`{p.name}`", text) for p, text in zip(every.Problem, _after_members(every.Problem), strict=True)
