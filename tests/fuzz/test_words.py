@@ -118,7 +118,7 @@ def test_a_bench_that_is_not_there_is_refused(rest: list[str], action: str) -> N
     assert code == 0 or err.count("\n") == 1, err
 
 
-@tried(40)
+@tried(20)
 @given(
     command=st.sampled_from(["envs", "evaluate"]),
     env=odd_words | st.sampled_from(["Reach", "Raech", "fastrod/Reach-v0"]),

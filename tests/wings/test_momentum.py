@@ -21,6 +21,7 @@ from fastrod.rotation import displaced
 from fastrod.types import Floats
 
 
+@pytest.mark.study(beyond=4)
 @pytest.mark.parametrize(("ratio", "dt"), [(0.2, 1e-3), (0.2, 1e-2), (1.0, 5e-3), (20.0, 1e-3)])
 @pytest.mark.parametrize("name", ["prototype", "five_segment_reacher"])
 def test_a_body_and_its_bent_rod_that_is_let_go_keep_their_momentum(
@@ -53,7 +54,7 @@ def test_it_falls_as_one_from_rest_and_from_a_fall() -> None:
         assert np.abs(body.rod.wrench).max() < 1e-6
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("name", ["prototype", "five_segment_reacher", "tdcr_a"])
 @pytest.mark.parametrize("dt", [1e-3, 1e-2])
 def test_the_apparent_stiffness_is_the_slope_of_the_wrench(name: str, dt: float) -> None:
