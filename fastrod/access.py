@@ -68,7 +68,7 @@ class Access:
         """First element of the path; new with every server."""
         name = socket.gethostname() if _every(host) else host  # `elsewhere` prints it without a route
         self.title = ""
-        """Of the page, in the browser's tab; empty: viser's own."""
+        """Title of the page, in the browser's tab; empty: viser's own."""
         self._names = (f"[{name}]" if ":" in name else name.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
@@ -178,7 +178,7 @@ class Served:
 
     @property
     def address(self) -> str:
-        """Of the page, key included: http://127.0.0.1:8080/KEY/ for instance."""
+        """Address of the page, key included: http://127.0.0.1:8080/KEY/ for instance."""
         return self.at("localhost" if _every(self.host) else self.host)
 
     def at(self, host: str) -> str:

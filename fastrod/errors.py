@@ -44,7 +44,7 @@ class UnknownNameError(FastrodError, KeyError):
 
 
 class Problem(Enum):
-    """What is wrong with a robot of a batch, for programs: the kind of a sentence in `State.problems`."""
+    """Cause of a robot's failure in a batch, for programs: the kind of a sentence in `State.problems`."""
 
     BAD_INPUT = "bad_input"
     """Its input cannot be used: not finite, out of range, impossible."""
@@ -84,7 +84,7 @@ class ProblemSentence(str):
         return made
 
     def __getnewargs__(self) -> tuple[str, Problem]:  # type: ignore[override]
-        """What `pickle` and `copy` make it from."""
+        """Return what `pickle` and `copy` make it from."""
         return str(self), self.kind
 
 
@@ -100,7 +100,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def shown(value: object, longest: int = 200) -> str:
-    """What was given, as an error sentence quotes it: its repr, cut in the middle where it is long.
+    """Return what was given, as an error sentence quotes it: its repr, cut in the middle where it is long.
 
     >>> shown("a" * 30, 20)
     "'aaaaaaa ... aaaaaa'"

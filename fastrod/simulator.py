@@ -105,9 +105,9 @@ class Simulator(Motions):
         robots, n_robots = options.checked_robots(robot, n_robots)
         options.check_options(points_per_segment, dt, outputs, kept_jacobian_tolerance)
         self.solver = options.check_solver(robots, solver, bool(dynamics), scheme, rho, modes)
-        """How rods are solved: "observer" or "modal"."""
+        """Solver of the rods: "observer" or "modal"."""
         self.device = devices.checked(device)
-        """Where the passes run."""
+        """Device on which the passes run."""
         options.check_fellows(self.solver, observer, contact, feel_contact, device, kept_jacobian_tolerance)
         super().__init__(
             robots,
@@ -124,7 +124,7 @@ class Simulator(Motions):
         if self.solver == "modal":
             self._use_modes(bool(dynamics), scheme, rho, modes)
         self.contact: ContactScene | None = contact
-        """What the rods may touch."""
+        """Scene that the rods may touch."""
         if contact is not None:
             rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
             self._engine = Engine(contact, rods, self._plain.length, self.n_points, self._passes.threads)
@@ -442,12 +442,11 @@ class Simulator(Motions):
         center: ArrayLike,
         body: int | None = None,
     ) -> None:
-        """From the next step on this obstacle gives way to the rods: what it is given by `obstacle_pose` is
-        where it would be without them. `translation` [m/N] under a force at its `center` (3,) of mass,
+        """Let this obstacle give way to the rods from the next step on: what it is given by `obstacle_pose`
+        is where it would be without them. `translation` [m/N] under a force at its `center` (3,) of mass,
         `rotation` (3, 3) [rad/(N m)] under a moment, both world and within one step: dt^2 / m and dt^2 I^-1
-        for a body in free flight. Obstacles of one rigid body have the same number
-        `body`. Raises `InputError` without a contact scene or where these are not numbers,
-        `UnknownNameError`.
+        for a body in free flight. Obstacles of one rigid body have the same number `body`. Raises
+        `InputError` without a contact scene or where these are not numbers, `UnknownNameError`.
         """
         engine = self._contact("set_free")
         k = engine.scene.index(obstacle)
@@ -472,16 +471,16 @@ class Simulator(Motions):
         return queries.swept_clearance(engine, now if before is None else before, poses, now, tolerance, some)
 
     def ray_cast(self, origin: ArrayLike, direction: ArrayLike, longest: float = np.inf) -> queries.Hits:
-        """What distance sensors see: rays (n_rays, 3) or (n_robots, n_rays, 3), world, against the obstacles
-        where they are now, up to `longest` [m]. Raises `InputError` without a contact scene, on a wrong shape
-        or a direction of length 0."""
+        """Return what distance sensors see: rays (n_rays, 3) or (n_robots, n_rays, 3), world, against the
+        obstacles where they are now, up to `longest` [m]. Raises `InputError` without a contact scene, on
+        a wrong shape or a direction of length 0."""
         return queries.ray_cast(self._contact("ray_cast"), origin, direction, longest)
 
     def _moved_obstacles(
         self, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None
     ) -> tuple[Any, Any] | None:
-        """Where obstacles that no rod feels will be, and their velocities, checked; they move once all other
-        inputs are, too."""
+        """Return where obstacles that no rod feels will be, and their velocities, checked; they move once
+        all other inputs are, too."""
         if self._engine is None:
             if pose or velocity:
                 raise InputError(
@@ -512,9 +511,9 @@ class Simulator(Motions):
         return found.position + np.einsum("nkij,kj->nki", found.rotation[..., :2], offset), found.rotation
 
     def measure(self) -> SensedPoses:
-        """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in
-        the base frame, effects of sensing included. Effects before the rod show in the state itself. Raises
-        `InputError` before the first step."""
+        """Return what a camera on the base sees of the last state: tip (and `log_points`, with
+        outputs="full") in the base frame, effects of sensing included. Effects before the rod show in the
+        state itself. Raises `InputError` before the first step."""
         state, ports = self._last("measure")
         points = np.zeros((self.n_robots, 0, 3))
         if self.outputs == "full" and self.robots[0].log_points:

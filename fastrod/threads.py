@@ -23,9 +23,9 @@ _Answer = TypeVar("_Answer")
 
 @cache
 def _libraries(with_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int], object]]]:  # noqa: ARG001
-    """How to ask and set the threads of each BLAS library of this process; scipy brings one of its own. Found
-    once: to look takes 5 ms. OpenBLAS is asked itself: by way of threadpoolctl a call costs 5 us more, which
-    is 1 % of a robot's step."""
+    """Return how to ask and set the threads of each BLAS library of this process; scipy brings one of its
+    own. Found once: to look takes 5 ms. OpenBLAS is asked itself: by way of threadpoolctl a call costs 5
+    us more, which is 1 % of a robot's step."""
     found = list[tuple[Callable[[], int], Callable[[int], object]]]()
     for lib in ThreadpoolController().lib_controllers:
         names = [name for name in lib.check_symbols if hasattr(lib.dynlib, name)]
@@ -37,7 +37,8 @@ def _libraries(with_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int]
 
 
 class _Held:
-    """How many callers hold BLAS at one thread, and what each library had before the first of them."""
+    """Count of callers that hold BLAS at one thread, and the threads of each library before the first of
+    them."""
 
     lock = threading.Lock()
     callers = 0

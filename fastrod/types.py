@@ -37,7 +37,7 @@ class Layout(NamedTuple):
 
 
 class Params(NamedTuple):
-    """What a robot is."""
+    """Parameters of robots."""
 
     length: Floats
     """(n_robots, n_segments) without extension [m]."""
@@ -58,7 +58,7 @@ class Params(NamedTuple):
 
 
 class Ports(NamedTuple):
-    """What the kernel reads at one step; effects change it in place at their seam."""
+    """Inputs that the kernel reads at one step; effects change it in place at their seam."""
 
     tendon_length: Floats
     """(n_robots, n_tendons) absolute, base to where the tendon ends [m]."""
@@ -90,7 +90,7 @@ class Ports(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the observer carries from one step to the next."""
+    """Memory of the observer from one step to the next."""
 
     x: Floats
     """(n_robots, n_x) boundary unknowns: base moment, material [N m]; tensions of the free tendons [N]; with
@@ -115,7 +115,7 @@ class Memory(NamedTuple):
 
 
 class RodShape(NamedTuple):
-    """What a pass writes: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not
+    """Output of a pass: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not
     wanted have length 0."""
 
     position: Floats
@@ -241,13 +241,13 @@ TROUBLE = _record(
     ("distance", np.float64),
     ("from_rest", np.float64),
 )
-"""What keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle (from
-n_obstacles on a rod; -1: none), where [m], by how much [m], and how far its world is from rest: the largest
-of motion, residual and violation [m]."""
+"""Cause that keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle
+(from n_obstacles on a rod; -1: none), where [m], by how much [m], and how far its world is from rest: the
+largest of motion, residual and violation [m]."""
 
 
 class ContactRods(NamedTuple):
-    """What contact needs to know of the robots themselves."""
+    """Data of the robots that contact needs."""
 
     radius: Floats
     """(n_robots, n_segments) [m]."""
@@ -296,8 +296,8 @@ class ContactMotion(NamedTuple):
     rotation_before: Floats
     curvature_before: Floats
     arclength_before: Floats
-    """Where the rods have come from, and through nothing since: the last step, or the last pass of a damped
-    iteration."""
+    """Cross-sections from which the rods have come, having met nothing since: the last step, or the last
+    pass of a damped iteration."""
     position_slip: Floats
     rotation_slip: Floats
     curvature_slip: Floats

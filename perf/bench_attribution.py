@@ -1,4 +1,5 @@
-"""How often the missing effect is named: sealed logs of a plant that shares no code with the model."""
+"""Frequency with which the missing effect is named: sealed logs of a plant that shares no code with the
+model."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def simulator_fraction(env: Any, n: int) -> float:
 
 
 def steps_for(n_envs: int, quick: bool) -> int:
-    """Of one run: some 100 ms, and no fewer than an episode."""
+    """Return the number of steps of one run: some 100 ms, and no fewer than an episode."""
     return 3 if quick else max(40, min(2000, 100_000 // n_envs))
 
 

@@ -54,7 +54,7 @@ KILLED = "killed process"
 
 
 class Trial(NamedTuple):
-    """What one fault led to; times [s]."""
+    """Consequence of one fault; times [s]."""
 
     found: float
     rest: float
@@ -91,7 +91,7 @@ class Rig:
         self._repeat(1.0 / COMMANDS, self.command)
 
     def _repeat(self, period: float, what: Callable[[], None]) -> None:
-        """From now on in real time; stepped time does it in `wait`."""
+        """Repeat an action from now on in real time; stepped time does it in `wait`."""
 
         def repeat() -> None:
             while not self._over.wait(period):
@@ -134,7 +134,7 @@ class Rig:
         self.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
 
     def storm_on(self, syncs: int) -> None:
-        """From now on so many SYNCs of another node in every 10 ms."""
+        """Send so many SYNCs of another node in every 10 ms from now on."""
         self.storm = syncs
         self._repeat(1e-3 / syncs * max(STORMS), self.sync)
 
@@ -189,7 +189,7 @@ INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
     "encoder jump": (lambda rig, k: rig.drives.encoder_jump(k % 4, _COUNTS[k % 4]), "moved its tendon by"),
     "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
-"""How each is done to the k-th trial, and what its sentence must say."""
+"""Injection of each fault into the k-th trial, and what its sentence must say."""
 
 
 def run(seconds: float, *, stepped: bool, eds: Path | None) -> Row:

@@ -36,7 +36,7 @@ TARGET = 60.0  # s for a million shapes on two cores
 
 
 class Costs(NamedTuple):
-    """What the table of N machines is computed from, all measured here."""
+    """Measured costs from which the table of N machines is computed."""
 
     task: float  # of one worker for one shard, written [s]
     start: float  # until the first worker begins, the cluster being there [s]

@@ -27,7 +27,7 @@ _TOLERANCE = 1e-9
 
 @dataclass
 class Count:
-    """What happened to the robots of one task."""
+    """Counts of the robots of one task."""
 
     steps: int = 0  # of environments
     robots: int = 0  # robot-steps of all simulators

@@ -161,8 +161,8 @@ def beam() -> list[Found]:
 
 
 def ringing(result: Result, run: str) -> str:
-    """How a run that no fit has seen rings, beside the model: frequency, and the decay of the amplitude over
-    the swings that both have within a second."""
+    """Return how a run that no fit has seen rings, beside the model: frequency, and the decay of the
+    amplitude over the swings that both have within a second."""
     rows = result.log.run == run
     seen, made = (
         ring_of(result.log.t[rows], tip[0, 0] - tip[:, 0], from_rest=True).until(WINDOW)

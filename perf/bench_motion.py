@@ -103,7 +103,7 @@ def batched(points: Sequence[tuple[Point, str]], n: int) -> list[tuple[Point, st
 
 
 def _again(tips: Array) -> str:
-    """How far the reference is from one of twice its steps."""
+    """Return how far the reference is from one of twice its steps."""
     (coarse,) = release.reference((release.FORCE,), 1e-4)
     return f"{float(np.sqrt(np.mean(np.sum((tips - coarse) ** 2, axis=-1)))):.0e}"
 

@@ -32,7 +32,7 @@ def robot(density: float, mass: float, damping: float, effects: tuple[dict[str, 
 
 
 def sealed(seed: int) -> tuple[str, RunLog]:
-    """What is sealed, and two runs of smooth commands up to 5 Hz with 0.1 mm of noise."""
+    """Return what is sealed, and two runs of smooth commands up to 5 Hz with 0.1 mm of noise."""
     rng, kind = np.random.default_rng(seed), KINDS[seed % len(KINDS)]
     offset = float(np.mean(load_robot("prototype").segments[0].tendons[0].offset))
     size = float(rng.uniform(0.02, 0.06)) * offset

@@ -25,7 +25,7 @@ from fastrod.types import Floats
 from report import Row, Section, bench, note_progress, table
 
 RHO = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
-"""From one sample to the next."""
+"""Correlation from one sample to the next."""
 SHAPES = (("excite", 15.0, 0.0), ("excite", 30.0, 0.0), ("wander", 15.0, 150.0), ("wander", 30.0, 90.0))
 """Inputs, Hz, s: `fastrod excite`; or 12 s of rest, wandering, 13 s of rest."""
 EFFECTS: dict[str, dict[str, float]] = {"backlash": {"half_width": 2e-4}, "creep": {}, "payload": {}}

@@ -92,7 +92,7 @@ def front(points: Sequence[Point]) -> list[tuple[float, float]]:
 
 
 def own_front(points: Sequence[Point]) -> list[tuple[float, float]]:
-    """Of `fastrod, settle`, the better of both calls."""
+    """Return the Pareto front of `fastrod, settle`, the better of both calls."""
     return front([point for point in points if point.peer.name.startswith(peer_fastrod.SETTLE.name)])
 
 
@@ -104,8 +104,8 @@ def between(x: float, known: Sequence[float], value: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times better fastrod is; `least`: it is at least this, for the peer lies beyond fastrod's
-    measured settings."""
+    """Ratio of fastrod's figure to another's; `least`: it is at least this, for the peer lies beyond
+    fastrod's measured settings."""
 
     value: float
     least: bool = False
@@ -134,7 +134,7 @@ def error_ratio(error: float, used: float, own: Sequence[tuple[float, float]]) -
 
 
 def both_ratios(point: Point, own: Sequence[tuple[float, float]]) -> tuple[Ratio, Ratio, float]:
-    """Of time, of error, and the larger one; nan counts as nothing."""
+    """Return the ratios of time and of error, and the larger one; nan counts as nothing."""
     ratios = time_ratio(*point[2:4], own), error_ratio(*point[2:4], own)
     return *ratios, max((ratio.value for ratio in ratios if not math.isnan(ratio.value)), default=0.0)
 

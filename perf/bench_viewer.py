@@ -81,7 +81,7 @@ def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, float]]:
 
 
 def answers(presses: int) -> list[float]:
-    """From a key on a slider to the change of the simulator's state, each [s]; one page."""
+    """Measure the times from a key on a slider to the change of the simulator's state, each [s]; one page."""
     from windows import Window
 
     from fastrod_viewer.app import App

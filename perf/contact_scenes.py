@@ -177,8 +177,8 @@ def make_batch(seed: int, index: int, n: int = TOGETHER) -> Batch:
 def _poses(
     robot: Robot, solid: Obstacle, radius: float, lengths: Array, there: Array, rng: np.random.Generator
 ) -> Array:
-    """Where the obstacle is at each step: clear of the free rod at first, in its way at last; half of them
-    stand still. None comes near the mounting, where nothing can give way."""
+    """Return where the obstacle is at each step: clear of the free rod at first, in its way at last; half
+    of them stand still. None comes near the mounting, where nothing can give way."""
     n, free = lengths.shape[1], []
     sim = Simulator(robot, n, points_per_segment=20)
     for length in lengths:
@@ -242,7 +242,7 @@ def _away(solid: Obstacle, centre: Array, out: Array, rotation: Array, nodes: Ar
 
 @dataclass
 class Played:
-    """What became of a batch; arrays (N_STEPS + 1, n) but for the time."""
+    """Record of a batch; arrays (N_STEPS + 1, n) but for the time."""
 
     kind: str
     ok: Any

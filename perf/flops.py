@@ -1,5 +1,5 @@
-"""How much arithmetic an observer pass is: a process of its own, this module as a script, runs the kernels as
-plain Python, one lane wide, on numbers that count what is done with them.
+"""Count of the arithmetic of an observer pass: a process of its own, this module as a script, runs the
+kernels as plain Python, one lane wide, on numbers that count what is done with them.
 
 Each integration step costs the same, so with N >= 2 steps a segment operations(N) = operations(2) + (N - 2)
 (operations(3) - operations(2)) is exact. What the compiler saves by common subexpressions is not taken off,
@@ -36,7 +36,7 @@ class Tally(NamedTuple):
 
     @property
     def instructions(self) -> float:
-        """What remains when every product that is added at once goes into a fused multiply-add."""
+        """Return what remains when every product that is added at once goes into a fused multiply-add."""
         return self.flops - self.fused
 
     def __add__(self, other: Any) -> Tally:
@@ -106,7 +106,7 @@ def count(wanted: dict[str, int], forces: bool) -> dict[str, Tally]:
 
 
 def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[dict[str, Tally]]:
-    """As `count`, without the formula: for each number of points, the operations of every robot."""
+    """See `count`, without the formula: for each number of points, the operations of every robot."""
     found = in_fresh_process(__file__, [list(robots), forces, list(points)], NUMBA_DISABLE_JIT="1")
     return [{key: Tally(*tally) for key, tally in one.items()} for one in found]
 

@@ -1,4 +1,4 @@
-"""What only a fresh process shows, which is this module as a script: memory, and the time to start."""
+"""Measurements in a fresh process, which is this module as a script: memory, and the time to start."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _STUCK = 40.0  # seconds after which a worker is ended, on a machine that does o
 
 
 def work(indices: Sequence[int], seed: int, ends: Connection) -> None:
-    """Of a worker process: an index before each file, its outcome after it."""
+    """Work as a worker process: an index before each file, its outcome after it."""
     with tempfile.TemporaryDirectory() as folder:
         originals = Originals()
         warm(Path(folder), originals)
@@ -57,7 +57,7 @@ class Worker:
         return self.at >= 0 and time.monotonic() - self.since > _STUCK
 
     def receive(self) -> Iterator[Outcome]:
-        """What it sends, or what is left of it."""
+        """Return what it sends, or what is left of it."""
         try:
             got: Any = self.ends.recv()
         except EOFError:

@@ -61,7 +61,7 @@ def energy(robot: Robot, state: State) -> Array:
 
 @dataclass
 class Count:
-    """What happened to the robots of one campaign."""
+    """Counts of the robots of one campaign."""
 
     steps: int = 0  # robot-steps
     lost: int = 0

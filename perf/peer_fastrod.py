@@ -44,7 +44,7 @@ def _together(points: int, tolerance: float) -> Iterator[Solve]:
 
 @contextmanager
 def _step(points: int, passes: int) -> Iterator[Solve]:
-    """From load to load in `passes` equal parts, one pass each, so that the answer lags."""
+    """Go from load to load in `passes` equal parts, one pass each, so that the answer lags."""
     sim = _simulator(points, 1)
 
     def solve(force: Array) -> Array:

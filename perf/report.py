@@ -60,7 +60,7 @@ class Section:
     failed: bool = False  # a check in which something is not as it must be: the exit code is then 1
 
     def as_json(self) -> dict[str, object]:
-        """As JSON knows it, which knows neither nan nor infinity."""
+        """Return the section as JSON knows it, which knows neither nan nor infinity."""
         meaning = {column.key: column.head.replace("\n", " ") for column in self.columns}
         rows = [
             {key: None if isinstance(x, float) and not math.isfinite(x) else x for key, x in row.items()}
@@ -116,7 +116,7 @@ def note_progress(what: str) -> None:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
+    """Return what the figures were measured on."""
     import numba
     import numpy
     import scipy
@@ -146,7 +146,7 @@ class Measurement:
         self.clock, self.times = clock, list[float]()
 
     def take(self, run: Callable[[], Any]) -> Any:
-        """What one call returns, timed without the collector of garbage."""
+        """Return what one call returns, timed without the collector of garbage."""
         gc.disable()
         try:
             start = self.clock()
@@ -192,7 +192,7 @@ def best(run: Callable[[], object], repeats: int) -> float:
 
 
 def in_fresh_process(file: str, given: Any, **environment: str) -> Any:
-    """What a script prints as JSON, given this as JSON on its standard input."""
+    """Return what a script prints as JSON, given this as JSON on its standard input."""
     env, words = {**os.environ, **environment}, json.dumps(given)
     done = subprocess.run(
         [sys.executable, file], input=words, stdout=subprocess.PIPE, text=True, check=True, env=env

@@ -22,7 +22,7 @@ from fastrod.simulator import Simulator
 from fastrod.types import Floats
 
 YOUNGS_MODULUS, POISSON, SIDE = 263_824.0, 0.499, 0.03
-"""Of the ETH beam, published: Pa, -, m."""
+"""Constants of the ETH beam, published: Pa, -, m."""
 SHEAR_COEFFICIENT = 5.0 / 6.0
 WINDOW = 1.0
 """s of ringing that are compared."""
@@ -53,7 +53,7 @@ class Ring:
 
     @property
     def frequency(self) -> float:
-        """Of the straight line through the times of all turning points [Hz]."""
+        """Frequency of the straight line through the times of all turning points [Hz]."""
         return 0.5 / float(np.polyfit(np.arange(len(self.time)), self.time, 1)[0])
 
     def until(self, time: float) -> Ring:
@@ -79,8 +79,8 @@ def ring_of(t: Floats, x: Floats, *, from_rest: bool = False) -> Ring:
 
 
 def measured_ring(log: RunLog) -> Ring:
-    """Of one run of the beam: the drop of its tip after the release, from the first time that it turned back
-    (the second turning point)."""
+    """Return the ring of one run of the beam: the drop of its tip after the release, from the first time
+    that it turned back (the second turning point)."""
     drop = log.tip_position[0, 0] - log.tip_position[:, 0]
     began = int(np.flatnonzero(np.abs(drop) > _STARTED)[0])
     every = ring_of(log.t[began:], drop[began:])
@@ -102,7 +102,7 @@ def beam(robot: Robot, load: float, *, damping_time: float = 0.0, shear: bool = 
 
 
 def rest_drop(robot: Robot) -> float:
-    """How far the tip hangs down at rest [m]."""
+    """Return how far the tip hangs down at rest [m]."""
     return -float(Simulator(robot, solver="modal", points_per_segment=4).settle().tip_position[0, 0])
 
 

@@ -110,7 +110,8 @@ class Shooter:
     integrator: str = "RK23"
     rtol: float = 1e-3
     atol: float = 1e-6
-    """Of lengths [m]; of the rotation's entries this over the length, of curvature over its square."""
+    """Absolute tolerance of lengths [m]; of the rotation's entries this over the length, of curvature over
+    its square."""
     ftol: float = 1e-8  # where the search ends, ftol and xtol of least_squares
     stop: float = 0.0
     """Largest boundary residual at which the search ends at once [m]; 0: where least_squares ends."""
@@ -216,7 +217,7 @@ class _EnoughError(Exception):
 
 
 class Run(NamedTuple):
-    """What a shooter took over stretches of points."""
+    """Time of a shooter over stretches of points."""
 
     cpu_s: float  # CPU time of one solve, mean over the points, best of the rounds [s]
     passes: float

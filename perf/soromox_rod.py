@@ -61,7 +61,7 @@ class SoromoxRod:
 
 
 def compiled(one: Callable[[Any], Any], together: bool) -> Solve:
-    """What solves one force, compiled: for all forces in one call, or one after the other."""
+    """Return what solves one force, compiled: for all forces in one call, or one after the other."""
     import jax
 
     fast = jax.jit(jax.vmap(one) if together else one)

@@ -47,7 +47,7 @@ class BusBench:
         self.bus = DriveBus(expected or specs, self.name, clock=self.clock, rate=100.0, eds=own)
 
     def run(self, cycles=1, target=None):
-        """What so many exchanges at the bus's rate bring."""
+        """Measure so many exchanges at the bus's rate."""
         pacer, seen = Pacer(self.clock, 100.0), []
         for _ in range(cycles):
             seen.append(self.bus.exchange(target))

@@ -10,7 +10,7 @@ from fastrod.simulator import Simulator
 
 HALF = np.sqrt(0.5)
 ROTATION = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}
-"""Of the base with the rod along a world axis, w x y z."""
+"""Rotation of the base with the rod along a world axis, w x y z."""
 
 
 def soft_robot(n_segments=2, **segment):
@@ -57,8 +57,8 @@ def cube(world, size, mass, position, friction=0.5):
 
 
 def clearance_of(contact):
-    """How far a thin rod beside a body of one shape is from it, and both ends of the rod (2, 3): the least
-    distance of the whole rod is at most theirs."""
+    """Return how far a thin rod beside a body of one shape is from it, and both ends of the rod (2, 3):
+    the least distance of the whole rod is at most theirs."""
     robot, name = soft_robot(1), contact.names[0]
     scene = ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0)
     sim = Simulator(robot, contact=scene)

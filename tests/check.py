@@ -102,7 +102,7 @@ TIERS = {
 
 
 class Done(NamedTuple):
-    """What became of a job."""
+    """Result of a job."""
 
     job: Job
     code: int
@@ -185,7 +185,7 @@ class Run:
         return every
 
     def table(self, wall: float) -> str:
-        """What each job took, and the ten dearest functions."""
+        """Return what each job took, and the ten dearest functions."""
         rows = [f"{'job':<28}{'CPU s':>8}{'wall s':>8}{'tests':>8}"]
         rows += [f"{d.job.name:<28}{d.cpu:8.0f}{d.wall:8.0f}{d.tests or '':>8}" for d in self.done]
         total = sum(d.cpu for d in self.done)

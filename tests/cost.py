@@ -1,4 +1,4 @@
-"""What each test costs, in CPU seconds of the process and of its children: a pytest plugin.
+"""Cost of each test, in CPU seconds of the process and of its children: a pytest plugin.
 
 `@pytest.mark.study` marks a function that is too dear for every check, `@pytest.mark.study(beyond=n)` all its
 cases but the first n. A function that is not marked and costs more than `MOST`, all its cases together, fails
@@ -33,7 +33,7 @@ _ALTERED = (numba.config.DISABLE_JIT, numba.config.BOUNDSCHECK, numba.config.ENA
 
 
 def cpu_seconds() -> float:
-    """Of this process and of the children that it has waited for."""
+    """CPU seconds of this process and of the children that it has waited for."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
@@ -57,7 +57,7 @@ class Once(event.Listener):
         event.register("numba:compiler_lock", self)
 
     def on_start(self, what: Any) -> None:
-        """Of the outermost import or compilation."""
+        """Note the start of the outermost import or compilation."""
         if self._depth == 0:
             self._begun = cpu_seconds()
         self._depth += 1

@@ -9,7 +9,7 @@ from bullets import ROTATION, carrier, cube, empty_world, move
 from fastrod.hosts import MountedRod, MujocoRod, add_capsules
 
 SPEED, RADIUS, SIZE, MASS = 0.1, 0.012, 0.08, 0.1
-"""Of the base [m/s]; of the rod, of a cube that it pushes [m]; of that cube [kg]."""
+"""Constants of the base [m/s]; of the rod, of a cube that it pushes [m]; of that cube [kg]."""
 BEYOND = 0.2 + RADIUS + 0.002 + SIZE / 2
 """x of a cube 2 mm beyond the tip [m]."""
 
@@ -62,7 +62,7 @@ class BulletStage:
 
 
 class MujocoStage:
-    """As `BulletStage`."""
+    """See `BulletStage`."""
 
     # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and
     # velocity together

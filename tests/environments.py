@@ -1,4 +1,4 @@
-"""What one environment did, alone or beside others."""
+"""Record of one environment, alone or beside others."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple

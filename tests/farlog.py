@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 LENGTHS, OFFSET = (0.12, 0.10), 0.009
-"""Of the two segments, and of every tendon from the backbone [m]."""
+"""Lengths of the two segments, and offset of every tendon from the backbone [m]."""
 ANGLES = np.radians([0.0, 120.0, 240.0, 60.0, 180.0, 300.0])
-"""Of the tendons; the last three end at the tip."""
+"""Angles of the tendons; the last three end at the tip."""
 PLAY, NOISE = 0.55e-3, 0.4e-3
 """Half width of the play, standard deviation of the noise on each axis [m]."""
 

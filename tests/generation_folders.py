@@ -1,4 +1,4 @@
-"""What the tests of data sets share: a small plan, and the bits of a folder."""
+"""Shared by the tests of data sets: a small plan, and the bits of a folder."""
 
 from __future__ import annotations
 

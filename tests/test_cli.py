@@ -332,7 +332,7 @@ def test_help_does_not_load_numba() -> None:
 
 
 SEED = 5
-"""Of what the emulator of these tests hides."""
+"""Seed of the emulator's hidden effects."""
 
 
 @pytest.fixture(scope="module")

@@ -227,8 +227,7 @@ def changes_tendons(robot: Robot, **inputs: Any) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_robots_without_wires_or_with_tensions_take_every_effect(name: str) -> None:
-    """Where no length is commanded there is nothing for an effect on lengths to do, but for those that act
-    on forces, too."""
+    """Effects on lengths do nothing where no length is commanded, but for those that act on forces, too."""
     for robot, inputs in (
         (rod("passive", extension=(-0.01, 0.01)), {}),
         (rod("tendon_tension", 3, extension=(-0.01, 0.01)), {"tension": [0.3, 0.0, 0.1]}),
@@ -270,7 +269,7 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
-    """What a sweep leaves behind: numbers in every column of a tendon, a bend or a step, and no other."""
+    """Columns of a sweep: numbers in every column of a tendon, a bend or a step, and no other."""
     columns_of = {"backlash": 3, "friction": 6, "creep": 2, "second_order_lag": 3}
     assert {*columns_of, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()

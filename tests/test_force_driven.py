@@ -302,7 +302,7 @@ def test_robot_that_hangs_and_is_said_to_stand_is_refused() -> None:
 
 @pytest.mark.study(beyond=0)
 def test_modulus_density_and_taper_are_fitted() -> None:
-    """Of a body that is 1.3 times as stiff, 0.9 times as heavy and more tapered than its file says."""
+    """A body that is 1.3 times as stiff, 0.9 times as heavy and more tapered than its file says."""
     from fastrod.identification.log.unknowns import _of_material
 
     asked = '[fit]\n"material.youngs_modulus" = {sd = 0.5}\n"material.density" = {sd = 0.2}\n'

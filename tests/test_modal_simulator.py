@@ -40,7 +40,7 @@ def simulator(
 
 
 def inputs(robot: Robot, k: int) -> dict[str, Any]:
-    """Of step k: bends, forces and bases of N robots, each its own."""
+    """Inputs of step k: bends, forces and bases of N robots, each its own."""
     t, i = 0.002 * k, np.arange(N)
     angles = 0.5 * np.sin(np.outer((20.0, 33.0), np.full(N, t)) + i)
     lengths = [bend(robot, *a) for a in angles.T]
@@ -299,7 +299,7 @@ def test_lumps_of_a_batch_agree_in_number() -> None:
 
 @BOTH
 def test_gravity_that_is_given_once_is_given_once(options: dict[str, Any]) -> None:
-    """Of the rod and of its lumps."""
+    """Gravity acts on the rod and on its lumps."""
     robot = heavy(lumps=(Lump(at=0.03, mass=0.01),))
     sim = simulator(robot, options, 1)
     forces = [

@@ -1,4 +1,4 @@
-"""What happens around a compilation: a line on stderr before the large kernels, once a process and not where
+"""Notices around a compilation: a line on stderr before the large kernels, once a process and not where
 they are cached, and no garbage collection."""
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_it_is_silent_on_request(tmp_path: Path) -> None:
 
 
 class Compilation:
-    """What numba says of one."""
+    """Record of one compilation by numba."""
 
     def __init__(self, function: object) -> None:
         self.data = {"dispatcher": self}

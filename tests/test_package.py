@@ -1,4 +1,4 @@
-"""What is built is what was meant: one wheel, an sdist that builds the same, extras that stand alone."""
+"""The built packages: one wheel, an sdist that builds the same, extras that stand alone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fastrod.logs.runlog import read_log, write_log
 from importlib.resources import files
 log = read_log(files("fastrod") / "data" / "demo_log.csv", fastrod.load_robot("prototype"))
 """
-"""What every installation does."""
+"""Smoke test of every installation."""
 ALSO = {
     "": "import numba, scipy, fcl, trimesh, rich, matplotlib",
     "parquet": "write_log(log, 'log.parquet'); assert len(read_log('log.parquet', "
@@ -41,7 +41,7 @@ ALSO = {
     "cuda": "from fastrod.solver.gpu import device",
     "network": "from fastrod.identification.learned import network; import sklearn",
 }
-"""What its extra is for, in one line."""
+"""Purpose of each extra, in one line."""
 
 
 def built(target: Path, source: Path) -> list[Path]:

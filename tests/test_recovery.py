@@ -232,7 +232,7 @@ def test_steps_and_settle_agree_on_loads_along_the_axis(load: float) -> None:
 
 
 def test_a_press_counts_as_far_as_the_rod_stands_straight() -> None:
-    """Of the same force on the same robot: along the rod all of it, across it none, pulling none; what has
+    """The same force on the same robot: along the rod all of it, across it none, pulling none; what has
     buckled and lies folded beside its base is not pressed."""
     robot = load_robot("prototype")
     sim = Simulator(robot, threads=1)

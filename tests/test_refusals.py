@@ -1,4 +1,4 @@
-"""What cannot be is one sentence: what was given, and what would be right."""
+"""Impossible inputs give one sentence: what was given, and what would be right."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def settle(*given: Any, **named: Any) -> object:
 
 
 def step(**named: Any) -> object:
-    """Of three robots that may extend."""
+    """Step three robots that may extend."""
     return three().step(REST, **named)
 
 

@@ -51,7 +51,8 @@ def other_robot() -> Robot:
 
 
 def log_of_the_other(n: int = 8) -> RunLog:
-    """What shooting makes of `other_robot`: two runs along a spiral of bends, the second one under a load."""
+    """Return what shooting makes of `other_robot`: two runs along a spiral of bends, the second one under
+    a load."""
     from fastrod.reference import shoot
 
     fraction = np.tile(np.arange(1, n + 1) / n, 2)

@@ -1,4 +1,5 @@
-"""What fuzzing has found, each once: odd files, paths and inputs that now are a result or one sentence."""
+"""Findings of the fuzz tests, each once: odd files, paths and inputs that now are a result or one
+sentence."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def counts() -> list[int]:
 
 @pytest.fixture(autouse=True)
 def two_threads() -> Iterator[None]:
-    """As on a machine with two cores, whatever this one has."""
+    """Set two threads, as on a machine with two cores, whatever this one has."""
     with threadpool_limits(2, "blas"):
         yield
 

@@ -150,6 +150,19 @@ def test_names_in_the_expressions_of_f_strings_are_seen() -> None:
 
 
 @pytest.mark.study
+def test_a_docstring_begins_with_a_verb_or_names_the_thing() -> None:
+    found = []
+    for file in sources(*PACKAGES):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            # strings that stand alone: docstrings, and those below attributes
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                text = str(node.value.value)
+                if re.match(r"\s*(What|Where|How|Who|Of|As|From)\b", text):
+                    found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {text[:40]}")
+    assert found == []
+
+
+@pytest.mark.study
 def test_a_public_class_name_stands_for_one_class() -> None:
     places = defaultdict(list)
     for file in sources(*PACKAGES):

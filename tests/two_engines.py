@@ -8,12 +8,12 @@ import numpy as np
 DT = 0.005
 CASES = ("hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block")
 JOINTS = (0.0, -1.2, 1.4, -1.77, -1.57, 0.0)
-"""Of the arm: the flange looks down [rad]."""
+"""Joint angles of the arm: the flange looks down [rad]."""
 ADAPTER, BEND, SPRING, DAMPER, MASS = 0.03, 0.8, 10.0, 4.0, 0.2
 HALF = (0.06, 0.01, 0.06)
-"""Of the block [m]."""
+"""Half size of the block [m]."""
 OFFSETS = np.array([0.0, 0.06, 0.03])
-"""Of the block's middle from the straight rod's tip [m]."""
+"""Offsets of the block's middle from the straight rod's tip [m]."""
 
 
 class Result(NamedTuple):
@@ -34,7 +34,7 @@ def carried() -> tuple[Any, dict[str, Any]]:
 
 
 def inputs(case: str) -> dict[str, Any]:
-    """Of the rod in a case."""
+    """Inputs of the rod in a case."""
     return carried()[1] | ({"tip_force": (0.2, 0.2, -0.1)} if case == CASES[1] else {})
 
 
@@ -92,7 +92,7 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
 
 
 def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
-    """As `in_pybullet`."""
+    """See `in_pybullet`."""
     import mujoco
 
     from fastrod.hosts import MujocoRod, add_capsules
@@ -130,7 +130,7 @@ def at_rest(engine: str, case: str, steps: int = 300) -> Result:
 
 
 def apart(a: Result, b: Result) -> dict[str, float]:
-    """How far two engines are apart: tips by the rod's length, forces and moments by the larger."""
+    """Return how far two engines are apart: tips by the rod's length, forces and moments by the larger."""
     robot = carried()[0]
 
     def relative(u: Any, v: Any) -> float:

@@ -111,7 +111,7 @@ class Window:
         self.page.get_by_role("option", name=option, exact=True).click()
 
     def place_of(self, point: Any, app: Any) -> tuple[float, float]:
-        """Where a point (3,) world [m] is drawn, in pixels of the window."""
+        """Return where a point (3,) world [m] is drawn, in pixels of the window."""
         camera = next(iter(app.server.get_clients().values())).camera
         index = matrix_from_quaternion(np.array([camera.wxyz]))[0]
         x, y, z = index.T @ (np.asarray(point) - camera.position)

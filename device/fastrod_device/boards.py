@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 APART = 0.06
-"""How far a corner of the board must be from where it was in every picture that was taken, as a part of the
-picture's diagonal."""
+"""Least distance of a corner of the board from where it was in every picture that was taken, as a fraction
+of the picture's diagonal."""
 PATIENCE = 60.0
 """Time in which no picture can be taken, after which there will be no more [s]."""
 _STILL = 0.004  # of the diagonal: a corner that moves farther from frame to frame is blurred
@@ -45,10 +45,10 @@ _MOVED, _ROTATED = 0.005, math.radians(2.0)  # of where an emulated camera stand
 
 
 class BoardMover(Protocol):
-    """Who holds the board."""
+    """Interface of whoever moves the calibration board."""
 
     def wave(self) -> None:
-        """From now on it is shown near and far, tilted to all sides, now and then at rest."""
+        """Show the board near and far from now on, tilted to all sides, now and then at rest."""
 
     def place(self, position: Floats, quaternion: Floats) -> None:
         """It is at base_from_board, position (3,) [m] and quaternion (4,), when this returns, and stays."""
@@ -130,8 +130,8 @@ class BoardEye:
 
 
 def bent(camera: Camera, seed: int) -> Camera:
-    """What an emulated camera truly is, where a file says `camera`: another focal length by some per cent,
-    and a bent lens."""
+    """Return what an emulated camera truly is, where a file says `camera`: another focal length by some
+    per cent, and a bent lens."""
     rng = np.random.default_rng([seed, 2])
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     scale = 1.0 + rng.uniform(0.01, _FOCUS) * rng.choice([-1.0, 1.0])
@@ -145,8 +145,8 @@ def bent(camera: Camera, seed: int) -> Camera:
 
 
 def moved(camera: Camera, seed: int) -> Camera:
-    """Where an emulated camera truly stands, where a file says `camera`: off by some millimetres and
-    degrees."""
+    """Return where an emulated camera truly stands, where a file says `camera`: off by some millimetres
+    and degrees."""
     rng = np.random.default_rng([seed, 3])
     position = np.array(camera.position) + _MOVED * rng.uniform(-1.0, 1.0, 3)
     quaternion = product(
@@ -282,8 +282,8 @@ def lens_table(found: CameraCalibration, file: Camera, truth: Camera | None) -> 
 
 
 def place_table(found: MarkerRegistration, file: Camera, truth: Camera | None) -> Table:
-    """Where the camera stands: position, and how it is turned from where the file has it, each with standard
-    errors."""
+    """Return where the camera stands: position, and how it is turned from where the file has it, each with
+    standard errors."""
     table = _table("base_from_camera", truth)
     poses = [(found.position, found.quaternion), file.base_from_camera] + (
         [] if truth is None else [truth.base_from_camera]

@@ -1,4 +1,4 @@
-"""What a camera is, and where it stands, from pictures of a printed board."""
+"""A camera's lens and pose, from pictures of a printed board."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class BoardFinder:
         self._detector = cv2.aruco.CharucoDetector(shape)
 
     def find(self, image: Picture) -> BoardView:
-        """What a picture (h, w) shows of it; the board may stick out of it."""
+        """Return what a picture (h, w) shows of it; the board may stick out of it."""
         corners, ids, _, _ = self._detector.detectBoard(image)
         numbers = np.ravel(ids).astype(int) if ids is not None else np.zeros(0, dtype=int)
         points, n = self._places[numbers], len(numbers)
@@ -151,7 +151,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MarkerRegistration:
-    """Where a camera stands, and how well that is known."""
+    """Pose of a camera, and how well it is known."""
 
     position: Floats
     """(3,) of base_from_camera [m]."""
@@ -233,8 +233,8 @@ def calibrate(
 def register_base(
     images: Sequence[Picture], board: CharucoBoard, camera: Camera, *, position: Floats, quaternion: Floats
 ) -> MarkerRegistration:
-    """Where the camera stands, from pictures of a board at known places: base_from_board, one for all images
-    or one each.
+    """Return where the camera stands, from pictures of a board at known places: base_from_board, one for all
+    images or one each.
 
     `position` (3,) or (n, 3) [m], `quaternion` (4,) or (n, 4). Standard errors are the larger of two: from
     the corners' misfit, and from the scatter of single views, where there are 4 or more; an error that all

@@ -94,7 +94,7 @@ def _positive(value: float, name: str, unit: str, low: float, high: float) -> No
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """What a camera is and where it stands. Raises `InputError` for what no camera can be.
+    """A camera: its lens and its pose. Raises `InputError` for what no camera can be.
 
     Axes as in OpenCV: x right, y down, z forward; the centre of the first pixel is (0, 0).
     """
@@ -112,7 +112,7 @@ class Camera:
     rate: float = 30.0
     """Frames per second [Hz]."""
     latency: float = 0.0
-    """From exposure to the frame's arrival [s]: what a time stamp on arrival is late."""
+    """Time from exposure to the frame's arrival [s]: what a time stamp on arrival is late."""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -161,7 +161,7 @@ class Camera:
 
     @property
     def base_from_camera(self) -> Pose:
-        """Where it stands."""
+        """Return where it stands."""
         return np.array(self.position), np.array(self.quaternion)
 
 
@@ -255,7 +255,7 @@ class Marker:
 
     @property
     def tip_from_marker(self) -> Pose:
-        """Where it sits on the tip."""
+        """Return where it sits on the tip."""
         return np.array(self.position), np.array(self.quaternion)
 
 
@@ -272,7 +272,7 @@ class CameraFrame:
 
 
 class FrameSource(Protocol):
-    """Where frames come from: a camera, an emulator, a file."""
+    """Source of frames: a camera, an emulator, a file."""
 
     def read(self) -> CameraFrame | None:
         """The newest frame that was not read yet, None where there is none; never waits. Raises `DeviceError`

@@ -8,7 +8,7 @@ from fastrod_device.tracker import MarkerSighting
 
 _REFUSED = (FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
 FLAGS = ("", "no marker", "outlier", "ambiguous", *_REFUSED)
-"""What may be wrong with a sighting; a log has the place in this list, so new ones go to its end."""
+"""Flags of a sighting that may be wrong; a log has the place in this list, so new ones go to its end."""
 EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
 """Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of
 the sighting's flag in `FLAGS` (0: trusted), and where the tip was seen, trusted or not [m]; then current_1
@@ -21,7 +21,7 @@ def names(n_tendons: int) -> tuple[str, ...]:
 
 
 def values(sighting: MarkerSighting, readings: Readings | None) -> dict[str, float]:
-    """Of one row; currents are left out where none are known."""
+    """Return the values of one row; currents are left out where none are known."""
     made = {
         "marker_error": sighting.error,
         "marker_size": sighting.size_px,

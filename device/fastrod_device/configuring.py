@@ -1,4 +1,5 @@
-"""What a drive is configured with once, by SDO, before it moves: who it is, its limits, its process data."""
+"""The configuration of a drive, written once by SDO before it moves: who it is, its limits, its process
+data."""
 
 from __future__ import annotations
 
@@ -59,12 +60,12 @@ _WITHOUT = {
     0x6085: "the deceleration of a quick stop is the drive's own",
     0x60C2: "how long it interpolates set-points is the drive's own",
 }
-"""What follows where a drive lacks an object."""
+"""Consequence of an object that a drive lacks."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DriveLimits:
-    """What drives refuse by themselves, in counts; one number for all drives, or (n_drives,)."""
+    """Limits that drives enforce by themselves, in counts; one number for all drives, or (n_drives,)."""
 
     position_limit: Ints | int
     """Greatest target position, either way [counts]."""
@@ -73,7 +74,7 @@ class DriveLimits:
     following_error: Ints | int
     """Beyond it a drive faults [counts]."""
     deceleration: Ints | int
-    """Of a quick stop [counts/s2]."""
+    """Deceleration of a quick stop [counts/s2]."""
     torque_limit: Ints | int
     """Greatest torque, either way [thousandths of the rated one]."""
     hold: bool
@@ -118,7 +119,7 @@ class Configurator:
         self.requests = 0
         """SDO requests so far."""
         self.notices: list[str] = []
-        """What the drives do not limit, for want of an object: a sentence each."""
+        """Limits that the drives do not enforce, for want of an object: a sentence each."""
         self._modes = [0] * len(specs)
 
     def read(self, drive: int, index: int, sub: int = 0) -> int:
@@ -179,7 +180,7 @@ class Configurator:
         return self._request(drive, index, sub, data) is not None
 
     def _request(self, drive: int, index: int, sub: int, data: bytes | None) -> bytes | None:
-        """What was read, or nothing after a write; None where the drive has no such object."""
+        """Return what was read, or nothing after a write; None where the drive has no such object."""
         node, what = self._specs[drive].node, f"0x{index:04X}:{sub:02X}"
         self._beat()
         self.requests += 1

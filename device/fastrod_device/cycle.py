@@ -36,7 +36,7 @@ _COMMAND = struct.Struct("<Hi")
 
 @final
 class Cycle:
-    """What is sent and what has come. Lists have one entry for each drive."""
+    """One cycle of the bus: the frames sent and received. Lists have one entry for each drive."""
 
     def __init__(self, line: BusLine, specs: Sequence[DriveSpec], clock: Clock, rate: float) -> None:
         """Subscribes at `line`, which is started afterwards; `rate` [1/s]."""
@@ -60,7 +60,7 @@ class Cycle:
         """When SYNCs were sent [s]."""
         self.inbox = Inbox(line, specs, clock, self.forget)
         self.newest = self.gather()
-        """Of the last exchange."""
+        """Feedback of the last exchange."""
 
     @property
     def n_drives(self) -> int:
@@ -68,7 +68,7 @@ class Cycle:
         return len(self.ids)
 
     def exchange(self, target: Ints | None = None) -> DriveFeedback:
-        """As `DriveBus.exchange`."""
+        """See `DriveBus.exchange`."""
         if target is not None:
             self.hold = whole(self.n_drives, target, "target")
         now = self.clock.now()
@@ -92,7 +92,7 @@ class Cycle:
         return feedback
 
     def quick_stop(self, reason: str = "quick stop was asked for") -> str:
-        """As `DriveBus.quick_stop`."""
+        """See `DriveBus.quick_stop`."""
         self.latch(reason)
         unsent = ""
         held = self.line.lock.acquire(timeout=0.02)  # rather two frames out of order than none

@@ -25,7 +25,7 @@ _POOL, _SLACK = 4, 128  # noise pictures that are kept, and by how much one may 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DrawnScene:
-    """How the picture looks. Raises `InputError`."""
+    """Look of the drawn picture. Raises `InputError`."""
 
     white: float = 210.0
     """Grey level of paper."""

@@ -36,7 +36,7 @@ _REACHED, _ACKNOWLEDGED, _ERROR = 0x0400, 0x1000, 0x2000  # bits of the statuswo
 
 @dataclass(frozen=True)
 class Jitter:
-    """How far periods of SYNC were from what they should be [s]."""
+    """Deviation of the periods of SYNC from their nominal length [s]."""
 
     n: int
     p50: float
@@ -97,7 +97,7 @@ class DriveBus:
 
     @property
     def newest(self) -> DriveFeedback:
-        """Of the last exchange."""
+        """Return the feedback of the last exchange."""
         return self._cycle.newest
 
     @property
@@ -122,7 +122,7 @@ class DriveBus:
 
     @property
     def jitter(self) -> Jitter:
-        """Of the SYNCs since `reset_statistics`."""
+        """Return the jitter of the SYNCs since `reset_statistics`."""
         off = np.abs(np.diff(np.array(self._cycle.syncs)) - 1.0 / self._cycle.rate)
         if not len(off):
             return Jitter(0, math.nan, math.nan, math.nan)
@@ -135,7 +135,8 @@ class DriveBus:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What the drives do not limit for want of an object, a sentence each; known after `connect`."""
+        """Return what the drives do not limit for want of an object, a sentence each; known after
+        `connect`."""
         return tuple(self._configurator.notices)
 
     # setting up

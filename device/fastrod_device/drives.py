@@ -39,11 +39,11 @@ class Drives(Protocol):
 
     @property
     def newest(self) -> DriveFeedback:
-        """Of the last exchange."""
+        """Return the feedback of the last exchange."""
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What the drives do not limit by themselves, a sentence each; known after `connect`."""
+        """Return what the drives do not limit by themselves, a sentence each; known after `connect`."""
 
     @property
     def stop_reason(self) -> str:
@@ -98,7 +98,7 @@ class BusSpec:
     """`[bus]` of a hardware file. Raises `InputError`, `UnknownNameError`."""
 
     kind: str = "epos4"
-    """Of the drives."""
+    """Kind of the drives."""
     bitrate: int = 1_000_000
     """[bit/s]."""
 
@@ -112,7 +112,7 @@ class BusSpec:
 
 
 class DrivenRobot(Protocol):
-    """What a hardware file says of its drives (`Hardware`)."""
+    """The drives of a hardware file (`Hardware`)."""
 
     @property
     def drives(self) -> tuple[DriveSpec, ...]:
@@ -120,7 +120,7 @@ class DrivenRobot(Protocol):
 
     @property
     def rate(self) -> float:
-        """Of the control loop [Hz]."""
+        """Rate of the control loop [Hz]."""
 
     @property
     def bus(self) -> BusSpec:

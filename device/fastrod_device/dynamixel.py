@@ -59,7 +59,7 @@ _REBOOT, _PAUSE, _REST = 2.0, 0.05, 0.2  # s
 
 @final
 class DynamixelBus:
-    """As `Drives`. A servo holds where it is on a quick stop; the zeros of homing are kept here, not in
+    """See `Drives`. A servo holds where it is on a quick stop; the zeros of homing are kept here, not in
     it."""
 
     def __init__(
@@ -98,7 +98,7 @@ class DynamixelBus:
 
     @property
     def stop_reason(self) -> str:
-        """As in `Drives`."""
+        """See `Drives`."""
         return self._reason if self._stopping else ""
 
     def connect(
@@ -110,7 +110,7 @@ class DynamixelBus:
         deceleration: Ints,
         torque_limit: Ints,
     ) -> None:
-        """As in `Drives`; position and following error are limited by the supervisor alone, as `notices`
+        """See `Drives`; position and following error are limited by the supervisor alone, as `notices`
         says."""
         for node in self._ids:
             self._line.request(node, PING, b"", "be found")
@@ -140,7 +140,7 @@ class DynamixelBus:
         self._require_heard(self.exchange(), "become operational")
 
     def enable(self) -> None:
-        """As in `Drives`."""
+        """See `Drives`."""
         if not self._setup:
             raise DeviceError("the servos are not connected; connect() first.")
         if self._stopping and not self._acknowledged:
@@ -166,12 +166,12 @@ class DynamixelBus:
         self.exchange()
 
     def acknowledge(self) -> None:
-        """As in `Drives`."""
+        """See `Drives`."""
         with self._gate:
             self._acknowledged = self._stopping
 
     def reset_faults(self) -> None:
-        """As in `Drives`: a servo in fault is rebooted, and set up again."""
+        """See `Drives`: a servo in fault is rebooted, and set up again."""
         now = self.exchange()
         self._require_heard(now, "report how they are")
         for i, node in enumerate(self._ids):
@@ -197,7 +197,7 @@ class DynamixelBus:
         self._refuse_faults("stays in fault")
 
     def exchange(self, target: Ints | None = None) -> DriveFeedback:
-        """As in `Drives`. Returns when all servos have answered, after 0.6 of a cycle at most. Raises
+        """See `Drives`. Returns when all servos have answered, after 0.6 of a cycle at most. Raises
         `InputError` for a target of another shape or kind."""
         goal = None if target is None else np.array(whole(len(self._ids), target, "target")) + self._zero
         lost = ""
@@ -221,7 +221,7 @@ class DynamixelBus:
         return feedback
 
     def quick_stop(self, reason: str = "quick stop was requested") -> str:
-        """As in `Drives`: each servo is to hold where the deceleration of `connect` brings it to rest from
+        """See `Drives`: each servo is to hold where the deceleration of `connect` brings it to rest from
         where it was last heard to be."""
         with self._gate:
             if not self._stopping or self._acknowledged:
@@ -241,7 +241,7 @@ class DynamixelBus:
     def homing(
         self, threshold: Ints, speed: Ints, *, rounds: int = 2, time_limit: float = 30.0
     ) -> DriveFeedback:
-        """As in `Drives`; `rounds`: what one tendon pulls the others feel. `time_limit` [s] of each."""
+        """See `Drives`; `rounds`: what one tendon pulls the others feel. `time_limit` [s] of each."""
         self.enable()
         at = self._hold.astype(np.float64)
         for i in list(range(len(self._ids))) * rounds:
@@ -265,7 +265,7 @@ class DynamixelBus:
         return self.exchange(np.rint(at).astype(np.int64) - self._zero)
 
     def close(self) -> None:
-        """As in `Drives`."""
+        """See `Drives`."""
         if self._closed:
             return
         self._closed = True
@@ -290,7 +290,7 @@ class DynamixelBus:
         return dict(zip(self._ids, self._hold.tolist(), strict=True))
 
     def _gather(self, lost: str) -> DriveFeedback:
-        """What is known now, in CiA 402's words; a servo that stopped by itself is enabled no more."""
+        """Return what is known now, in CiA 402's words; a servo that stopped by itself is enabled no more."""
         now = self._clock.now()
         columns = (np.array(column, np.int64) for column in zip(*self._raw, strict=True))
         on, errors, dog, current, velocity, position = columns

@@ -129,7 +129,7 @@ class _Servo:
         self.set(TORQUE_ENABLE, 0)
 
     def place(self, address: int) -> int:
-        """Where an address leads, through the indirect ones."""
+        """Return where an address leads, through the indirect ones."""
         k = address - INDIRECT_DATA
         return self.get(Register(INDIRECT_ADDRESS + 2 * k, 2)) if 0 <= k < _N_INDIRECT else address
 
@@ -199,7 +199,7 @@ class EmulatedDynamixels:
                 self._serve(packet)
 
     def read(self, timeout: float) -> bytes:  # noqa: ARG002
-        """What they have answered; they answer at once."""
+        """Return what they have answered; they answer at once."""
         with self._lock:
             data = bytes(self._out)
             self._out.clear()

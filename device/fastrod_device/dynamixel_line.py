@@ -37,7 +37,7 @@ GOAL_POSITION, PRESENT_CURRENT = Register(116, 4), Register(126, 2)
 PRESENT_VELOCITY, PRESENT_POSITION = Register(128, 4), Register(132, 4)
 INDIRECT_ADDRESS, INDIRECT_DATA = 168, 224
 READ_BACK = (TORQUE_ENABLE, HARDWARE_ERROR, BUS_WATCHDOG, PRESENT_CURRENT, PRESENT_VELOCITY, PRESENT_POSITION)
-"""What the indirect data hold, one after another: one sync read brings all of it."""
+"""Contents of the indirect data, one after another: one sync read brings all of it."""
 CURRENT_POSITION_MODE, WATCHDOG_TRIPPED = 5, 0xFF
 CURRENT_UNIT = 2.69e-3  # A
 VELOCITY_UNIT = 0.229 / 60.0 * 4096  # counts/s
@@ -56,7 +56,7 @@ _PATIENCE, _TRIES = 0.05, 3  # s for a question while setting up, which is repea
 
 
 class ServoReport(NamedTuple):
-    """What one servo reports in a cycle: `READ_BACK`, in its units."""
+    """Report of one servo in a cycle: `READ_BACK`, in its units."""
 
     torque_enabled: int = 0
     error: int = 0
@@ -110,7 +110,7 @@ class ServoLine:
         return int.from_bytes(data, "little", signed=register in (PRESENT_POSITION, PRESENT_VELOCITY))
 
     def reports(self, nodes: tuple[int, ...], patience: float) -> dict[int, ServoReport]:
-        """What these servos report, waited for so long [s]; one that is silent is missing. Raises
+        """Return what these servos report, waited for so long [s]; one that is silent is missing. Raises
         `OSError`."""
         data = struct.pack("<HH", INDIRECT_DATA, _REPORT.size) + bytes(nodes)
         answers = self._answers(Packet(EVERYBODY, SYNC_READ, data), nodes, patience)

@@ -53,7 +53,7 @@ class Packet(NamedTuple):
     data: bytes = b""
 
     def encoded(self) -> bytes:
-        """As it goes over the line.
+        """Return the packet's bytes on the line.
 
         >>> Packet(1, PING).encoded().hex(" ")
         'ff ff fd 00 01 03 00 01 19 4e'
@@ -98,7 +98,7 @@ class SerialPort(Protocol):
         """Send. Raises `OSError` where the port is gone."""
 
     def read(self, timeout: float) -> bytes:
-        """What has come, waited for so long [s]; empty where nothing has. Raises `OSError`."""
+        """Return what has come, waited for so long [s]; empty where nothing has. Raises `OSError`."""
 
     def close(self) -> None:
         """Let go of it."""

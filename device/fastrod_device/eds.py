@@ -75,7 +75,7 @@ def read_eds(path: Path) -> Any:
 
 
 def _members(options: dict[str, str]) -> int:
-    """Of an object that is described in one section with all its members."""
+    """Return the members of an object that is described in one section with all its members."""
     return max(0, min(_number(options.get("compactsubobj", "")) or 0, _MEMBERS))
 
 

@@ -1,4 +1,4 @@
-"""What a device can do wrong, as exceptions of fastrod."""
+"""Errors of devices, as exceptions of fastrod."""
 
 from __future__ import annotations
 

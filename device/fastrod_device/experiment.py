@@ -1,4 +1,4 @@
-"""What a prototype is put through: the run that separates effects, and paths that its tip follows."""
+"""Experiments with a prototype: the run that separates effects, and paths that its tip follows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fastrod.types import Flags, Floats
 from fastrod_device.prototype import Prototype
 
 Progress = Callable[[str, int, int], None]
-"""What is done, how far, of how much."""
+"""Callback of progress: the task, how many steps are done, how many there are."""
 Law = Callable[[Floats, float], Floats]
 """(3,) measured tip [m], nan where it is not known, and seconds since the path began -> (n_tendons,) changes
 of tendon length [m]."""
@@ -29,7 +29,7 @@ _SETTLE = 1.0  # s at rest before a path begins
 
 
 class BenchAssistant(Protocol):
-    """Who hangs the load and turns the bench: a person, or the emulator's own."""
+    """Interface of whoever hangs the load and rotates the bench: a person, or the emulator's own."""
 
     def hang(self, mass: float) -> None:
         """A known mass [kg] hangs on the tip when this returns; 0: none."""
@@ -108,7 +108,7 @@ def excite(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackingRun:
-    """How well the measured tip followed a path, from the moment it was on it."""
+    """Accuracy with which the measured tip followed a path, from the moment it was on it."""
 
     name: str
     log: RunLog

@@ -1,4 +1,4 @@
-"""What a drive's numbers mean: emergency codes (CiA 301, CiA 402 and those of an EPOS4) and states of the
+"""Meaning of a drive's numbers: emergency codes (CiA 301, CiA 402 and those of an EPOS4) and states of the
 drive, in words."""
 
 from __future__ import annotations

@@ -135,8 +135,8 @@ class FrameOrder:
 
 @final
 class Expectation:
-    """Where the model has the tip, so that of a marker's two planar poses the right one is taken: a robot
-    without its effects, followed step by step, good to some degrees."""
+    """Expected pose of the tip by the model, so that the right one of a marker's two planar poses is
+    taken: a robot without its effects, followed step by step, good to some degrees."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = replace(robot, effects=())

@@ -41,9 +41,9 @@ class Hardware:
     rate: float = 100.0
     """Control cycles a second, each with one SYNC [Hz]."""
     pretension: float = 1.0
-    """Of every tendon when it is homed [N]."""
+    """Pretension of every tendon when it is homed [N]."""
     homing_speed: float = 0.005
-    """Of a tendon [m/s]."""
+    """Homing speed of a tendon [m/s]."""
     bus: BusSpec = field(default_factory=BusSpec)
     """Kind of the drives, and bitrate."""
 
@@ -113,7 +113,7 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
 
 
 def _camera(given: object, hardware_file: Path, where: str) -> Camera:
-    """Of a table, or of a file that is named in its place."""
+    """Return the camera of a table, or of a file that is named in its place."""
     if not isinstance(given, str):
         return from_table(Camera, given, f"{where}: [camera]")
     if not (beside := hardware_file.parent / given).is_file():
@@ -125,7 +125,7 @@ def _camera(given: object, hardware_file: Path, where: str) -> Camera:
 
 
 def _robot(given: object, hardware_file: Path, where: str) -> Robot:
-    """Of a file beside the hardware file, or one that ships."""
+    """Return the robot of a file beside the hardware file, or one that ships."""
     if not isinstance(given, str):
         raise InputError(
             f"{where}: robot is {given!r}; give a shipped robot's name, or a robot file's in quotes."

@@ -32,7 +32,8 @@ from fastrod_device.tracker import MarkerSighting
 from fastrod_device.units import Transmission
 
 ZERO_SD = 2e-5
-"""How sure the tendons' zeros are, homed by camera: 0.1 mm at the tip, a fifth of it in the tendons [m]."""
+"""Standard deviation of the tendons' zeros after homing by camera: 0.1 mm at the tip, a fifth of it in the
+tendons [m]."""
 _TIGHTENED = 6.0  # s in which the tendons come to one tension
 _YIELD = 0.03  # of what would correct the tensions, in a cycle
 _STIFFEST = 1e-4  # m/N that a tendon is taken to give at least
@@ -106,8 +107,8 @@ def home(
 
 
 def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) -> str:
-    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is
-    found; empty where all is well.
+    """Return what is wrong with drives that are homed: one sentence without its full stop, of the first that
+    is found; empty where all is well.
 
     `speed` of the quickest tendon [m/s]: a drive that moves may be further behind where it was commanded to
     be.

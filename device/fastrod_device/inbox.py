@@ -1,4 +1,4 @@
-"""What drives send, gathered: filled by the bus's thread, read by the loop's."""
+"""Inbox of the drives' frames: filled by the bus's thread, read by the loop's."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Inbox:
         return feedback
 
     def last_code(self, drive: int) -> int | None:
-        """Of the last emergency of a drive that was an error."""
+        """Return the code of the last emergency of a drive that was an error."""
         return next((e.code for e in reversed(self.log) if e.drive == drive and e.code), None)
 
     def _on_status(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002

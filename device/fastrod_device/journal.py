@@ -87,7 +87,7 @@ class Journal:
                 self._spare = None
 
     def _open_again(self, path: Path) -> None:
-        """What an editor has put there is added to; what is gone is written again."""
+        """Add to whatever an editor has put there; what is gone is written again."""
         assert self._file is not None
         if path.exists():
             file = path.open("ab", buffering=0)
@@ -101,7 +101,8 @@ class Journal:
         return self._path.with_name(self._path.name + ".spare")
 
     def _append(self, text: str) -> None:
-        """Where it does not fit, the spare file gives up a block, and another if someone else was quicker."""
+        """Append a line; where it does not fit, the spare file gives up a block, and another if someone
+        else was quicker."""
         assert self._file is not None
         while True:
             try:

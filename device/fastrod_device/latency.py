@@ -1,4 +1,4 @@
-"""How far a camera is behind: the delay at which what was measured follows best from what was moved."""
+"""Latency of a camera: the delay at which what was measured follows best from what was moved."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LoopLatency:
     """A delay, and how well it is known."""
 
     delay: float
-    """Of the camera's positions behind the motion [s]; negative where their time stamps are early."""
+    """Delay of the camera's positions behind the motion [s]; negative where their time stamps are early."""
     stderr: float
     """Standard error of it [s]."""
 
@@ -226,8 +226,8 @@ def _least(loss: Callable[[float], float], start: float, width: float) -> float:
 
 
 def _stderr(rest: Callable[[float], Floats], delay: float, step: float) -> float:
-    """Of the delay, by the loss's curvature; scores that are alike from frame to frame are counted as Newey
-    and West (1987) do."""
+    """Standard error of the delay, by the loss's curvature; scores that are alike from frame to frame are
+    counted as Newey and West (1987) do."""
     r = rest(delay)
     slope = (rest(delay + step) - rest(delay - step)) / (2.0 * step)
     curvature = float((slope * slope).sum())

@@ -22,8 +22,8 @@ def _unit(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Of commands, of the robot, and of how old news may be; by default those of the 70 mm prototype. Raises
-    `InputError`.
+    """Limits on commands, on the robot, and on the age of feedback; by default those of the 70 mm prototype.
+    Raises `InputError`.
 
     >>> Limits(displacement=0.006).displacement
     0.006
@@ -43,11 +43,11 @@ class Limits:
     """A command that was meant longer ago is refused, and one must be renewed this often while the robot
     moves [s]."""
     feedback_age: float = 0.03
-    """Of a drive's process data [s]."""
+    """Largest age of a drive's process data [s]."""
     heartbeat_age: float = 0.15
-    """Of a drive's heartbeat [s]."""
+    """Largest age of a drive's heartbeat [s]."""
     sighting_age: float | None = 0.5
-    """Of the newest good sighting of the marker [s]; None: the camera stops nothing."""
+    """Largest age of the newest good sighting of the marker [s]; None: the camera stops nothing."""
     cycle: float = 0.05
     """Longest gap between two control cycles [s]."""
     following_error: float = 0.001

@@ -29,9 +29,9 @@ from fastrod_device.experiment import (
 from fastrod_device.prototype import Prototype
 
 APPROACH = 2.0
-"""From straight to the path [s]."""
+"""Time from the straight pose to the path [s]."""
 RATE = 20.0
-"""Of the plans [Hz]."""
+"""Rate of the plans [Hz]."""
 
 
 def planned(model: Robot, path: Trajectory) -> InversePlan:
@@ -44,10 +44,10 @@ def planned(model: Robot, path: Trajectory) -> InversePlan:
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Loop:
-    """What came out of it."""
+    """Result of the loop."""
 
     result: Result
-    """Of the identification."""
+    """Result of the identification."""
     before: Sequence[TrackingRun]
     """With plans by the model as it was."""
     after: Sequence[TrackingRun]

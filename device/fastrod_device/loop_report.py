@@ -1,4 +1,4 @@
-"""What the whole loop found, for machines, for the eye and for the terminal: loop.json, tracking.png, a
+"""Report of the whole loop, for machines, for the eye and for the terminal: loop.json, tracking.png, a
 table."""
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from fastrod_device.units import DriveSpec
 PROFILE, HOMING, CYCLIC = 1, 6, 8
 """Modes of operation, object 0x6060."""
 SUBSTEP = 1e-3
-"""Of the position controller [s]."""
+"""Step of the position controller [s]."""
 _LAG = 3e-3  # s, of the position loop
 _ACCELERATION = 5e6  # counts/s2 that the motor can
 _COAST = 2e6  # counts/s2 by which friction of the gear stops a shaft without current
@@ -48,11 +48,11 @@ class Motor:
         self.v = 0.0
         """[counts/s]."""
         self.offset = 0.0
-        """What the drive's counter says beyond the true angle [counts]."""
+        """Offset of the drive's counter from the true angle [counts]."""
         self.torque = 0.0
         """That holds the tendon, [thousandths of the rated torque]."""
         self.noise = 0.0
-        """Of the torque that is commanded."""
+        """Noise of the commanded torque."""
         self.blocked = False
         self.lasting = 0
         """Code of a fault whose cause is not gone, or 0."""
@@ -83,7 +83,7 @@ class Motor:
 
     @property
     def measured(self) -> float:
-        """What the encoder says [counts], not rounded."""
+        """Return what the encoder says [counts], not rounded."""
         return self.x + self.offset
 
     @property
@@ -355,7 +355,7 @@ class Motor:
             self.x += self.v * h
 
     def _settle(self, h: float) -> None:
-        """What follows from where it is: following error, end of a ramp."""
+        """Update what follows from its position: following error, end of a ramp."""
         if self.state == ENABLED:
             window = self.objects.values.get((0x6065, 0), 0)
             if window not in (0, 0xFFFFFFFF) and abs(self.command - self.measured) > window:

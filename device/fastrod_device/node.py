@@ -1,4 +1,4 @@
-"""What the bus sees of one emulated drive: its objects, its process data, whom it listens to."""
+"""One emulated drive as the bus sees it: its objects, its process data, whom it listens to."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIFE, LENGTH = 0x8130, 0x8210
 
 @final
 class Node:
-    """What the bus sees of one drive."""
+    """One drive as the bus sees it."""
 
     def __init__(self, spec: DriveSpec, period: float, eds: str | Path | None = None) -> None:
         """`period` [s] of set-points until the master sets another; `eds`: its dictionary's file."""

@@ -34,7 +34,7 @@ _CHUNK = 0.02  # s; longer gaps are gone through in pieces
 
 
 class Tendons(Protocol):
-    """What the tendons are fastened to: the emulated robot."""
+    """Interface of what the tendons are fastened to: the emulated robot."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
         """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each tendon has been wound since

@@ -28,11 +28,11 @@ class ProcessData:
     """A PDO as it was mapped."""
 
     cob_id: int
-    """Of its frames."""
+    """COB-ID of its frames."""
     kind: int
     """Transmission type: 1 to 240 every so many SYNCs, 254 and 255 at once."""
     layout: struct.Struct
-    """Of its bytes."""
+    """Layout of its bytes."""
     keys: tuple[Key, ...]
     """The objects in it."""
 
@@ -54,7 +54,7 @@ class Objects:
         self.preset: dict[Key, int] = {}
         """Values at power-on that differ from the dictionary's."""
         self.values: dict[Key, int] = {}
-        """Of the objects that the dictionary has."""
+        """Values of the objects that the dictionary has."""
         self.remapped = False
         """Process data was mapped anew since somebody set this back."""
         self._bytes: dict[Key, bytes] = {}
@@ -88,7 +88,7 @@ class Objects:
         return self.values[key] if key in self.values else at_power_on().get(key, 0)
 
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:  # noqa: ARG002
-        """What an SDO upload returns. Raises an SDO abort: no such object, or write only."""
+        """Return what an SDO upload returns. Raises an SDO abort: no such object, or write only."""
         var = self._find(index, subindex)
         if not var.readable:
             raise self._abort(_WRITE_ONLY)
@@ -99,7 +99,7 @@ class Objects:
         return bytes(var.encode_raw(value))
 
     def set_data(self, index: int, subindex: int, data: bytes, *_: object, **__: object) -> None:
-        """What an SDO download does. Raises an SDO abort: no such object, read only, of another length, or
+        """Answer an SDO download. Raises an SDO abort: no such object, read only, of another length, or
         not possible now."""
         var = self._find(index, subindex)
         if not var.writable:

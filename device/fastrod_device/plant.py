@@ -46,7 +46,7 @@ class _Load(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """What reached the rod at one time."""
+    """Inputs that reached the rod at one time."""
 
     t: float
     tendons: tuple[float, float, float, float]
@@ -121,8 +121,8 @@ class _Pair:
 
 
 def _across(side: float, moved: float, sharp: float) -> float:
-    """Where in the gap one is after a move, in half widths: the flank takes over with the share exp(-k (1 -
-    side)) of it."""
+    """Return where in the gap one is after a move, in half widths: the flank takes over with the share
+    exp(-k (1 - side)) of it."""
     if moved == 0.0:
         return side
     direction = 1.0 if moved > 0.0 else -1.0
@@ -269,8 +269,8 @@ class Plant:
             self._now = self._now._replace(load=self._load)
 
     def tip(self, t: float | None = None) -> tuple[Floats, Floats]:
-        """Where the tip truly is at `t` [s], within the last half second, or now: position (3,) [m] and
-        base_from_tip (3, 3), base frame.
+        """Return where the tip truly is at `t` [s], within the last half second, or now: position (3,) [m]
+        and base_from_tip (3, 3), base frame.
 
         After the last `advance` nothing moves. Raises `DeviceError` where the load makes the robot snap.
         """
@@ -278,7 +278,8 @@ class Plant:
             return self._pose(self._at(t))
 
     def tip_seen(self, t: float | None = None) -> tuple[Floats, Floats]:
-        """What a camera reports of the tip at `t` [s], or now; shapes, frames and errors as in `tip`."""
+        """Return what a camera reports of the tip at `t` [s], or now; shapes, frames and errors as in
+        `tip`."""
         with self._lock:
             t = self._now.t if t is None else t
             delay, wander, period, phase = self._late

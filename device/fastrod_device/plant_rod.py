@@ -72,7 +72,7 @@ _LOCK[:, 8] = OFFSET**2
 
 
 class PlantRest(NamedTuple):
-    """Where the rod is at rest, base frame."""
+    """Shape of the rod at rest, base frame."""
 
     position: Floats
     """(3,) of the tip [m]."""
@@ -103,7 +103,7 @@ class PlantRod:
     knee: float = 1.0
     """T0 [N]."""
     weight: float = 0.0
-    """Of the body, mean along it [N/m]."""
+    """Weight of the body, mean along it [N/m]."""
     slope: float = 0.0
     """The line weight is weight (1 + slope (1 - 2 x) + bulge (6 x (1 - x) - 1)), x from 0 at the base to
     1."""
@@ -260,7 +260,7 @@ def _frames(modes: Floats) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Of rows (n, 3), without np.cross' checks."""
+    """Cross product of rows (n, 3), without np.cross' checks."""
     return (a[:, _NEXT] * b[:, _OVER]) - (a[:, _OVER] * b[:, _NEXT])
 
 

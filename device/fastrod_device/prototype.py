@@ -109,7 +109,7 @@ class Prototype:
         self._set: Floats = np.zeros(n)
         self._past = Trace(n, int(_REMEMBERED * hardware.rate))
         self.readings: Readings | None = None
-        """Of the newest cycle."""
+        """Readings of the newest cycle."""
         self.sighting: MarkerSighting | None = None
         """The newest, trusted or not."""
         self._frame: CameraFrame | None = None
@@ -120,12 +120,12 @@ class Prototype:
         self._resting = False
         self._pacer: Pacer | None = None
         self.broken: Exception | None = None
-        """What went wrong in a thread of ours, if anything did."""
+        """Error in one of our own threads, if there was any."""
 
     @property
     def robot(self) -> Robot:
-        """What is driven: the hardware's model with the pretension that its tendons had when they were
-        homed."""
+        """Return what is driven: the hardware's model with the pretension that its tendons had when they
+        were homed."""
         return self._robot
 
     @property
@@ -199,7 +199,7 @@ class Prototype:
         return None if frame is None else self.tracker.look(frame, now=self.clock.now())
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None, *, stamp: float | None = None) -> None:
-        """As `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is
+        """See `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is
         refused.
 
         Raises `RefusedError` for what is beyond a limit, not finite, too late, or has an extension; ignored
@@ -214,8 +214,8 @@ class Prototype:
             self._pace = self.hardware.limits.rate
 
     def glide(self, dl: ArrayLike, seconds: float) -> None:
-        """As `command`, spread evenly over so long [s]: commands that come ten times slower than cycles then
-        make no jerks."""
+        """See `command`, spread evenly over so long [s]: commands that come ten times slower than cycles
+        then make no jerks."""
         longest = self.hardware.limits.command_age
         if not 0.0 < seconds <= longest:
             raise RefusedError(

@@ -1,4 +1,4 @@
-"""What drives say in one cycle, in their units and in ours; `Trace`: what they said lately."""
+"""Readings of the drives in one cycle, in their units and in ours; `Trace`: what they said lately."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ class Readings:
 
 @final
 class Trace:
-    """What encoders said and what was commanded in the newest cycles, for frames that come late. Its caller
-    has a lock."""
+    """Encoder readings and commands of the newest cycles, for frames that come late. Its caller has a
+    lock."""
 
     def __init__(self, n_tendons: int, n_cycles: int) -> None:
         """Empty."""

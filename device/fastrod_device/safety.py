@@ -39,7 +39,7 @@ _REMEMBERED = 1000  # changes of state
 
 
 class SafetyState(Enum):
-    """What the robot may do."""
+    """State of the safety supervisor: what the robot may do."""
 
     OFF = "off"
     """No drive is enabled."""
@@ -119,12 +119,12 @@ class Supervisor:
 
     @property
     def first(self) -> Fault | None:
-        """What stopped the robot; None while it is not stopped."""
+        """Return what stopped the robot; None while it is not stopped."""
         return next(iter(self.faults), None)
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """What stopped the robot, and what came after, each kind once; empty after `acknowledge`."""
+        """Return what stopped the robot, and what came after, each kind once; empty after `acknowledge`."""
         return tuple(self._faults)
 
     @property

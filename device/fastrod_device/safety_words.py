@@ -1,5 +1,4 @@
-"""What can be wrong with a robot on the bench: the kinds, and how each is found and reported in one
-sentence."""
+"""Faults of a robot on the bench: the kinds, and how each is found and reported in one sentence."""
 
 from __future__ import annotations
 
@@ -45,7 +44,7 @@ STATE_MASK = 0x006F
 """Bits of the statusword that tell the drive's state; without voltage and quick stop it is
 `STATE_MASK_SHORT`."""
 STATE_MASK_SHORT = 0x004F
-"""As above, for the states in which the quick-stop bit tells nothing."""
+"""Mask of the state bits, as above, for the states in which the quick-stop bit has no meaning."""
 OPERATION_ENABLED = 0x0027
 """The statusword under `STATE_MASK` of a drive that follows its set-points."""
 NMT_OPERATIONAL = 5
@@ -75,7 +74,7 @@ class Fault:
     kind: str
     """One of `KINDS`."""
     sentence: str
-    """What was found: drive, figure and limit."""
+    """Sentence on what was found: drive, figure and limit."""
     t: float
     """When it was found [s]."""
     drive: int | None = None
@@ -88,14 +87,14 @@ class Fault:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraWatch:
-    """What the camera says in one cycle."""
+    """Report of the camera in one cycle."""
 
     age: float
-    """Of the newest good sighting [s]; inf before the first."""
+    """Age of the newest good sighting [s]; inf before the first."""
     frozen: bool
     """The source repeats its frames."""
     flag: str = ""
-    """Of the newest sighting, where it is not trusted."""
+    """Flag of the newest sighting, where it is not trusted."""
 
 
 def in_hex(code: int) -> str:
@@ -134,7 +133,7 @@ class Inspector:
         self._n, self._limits, self._nodes, self._words = n_drives, limits, tuple(nodes), words
 
     def name(self, drive: int) -> str:
-        """As in `drive 2 (node 5)`, counted from 1; without the node where none is known."""
+        """See `drive 2 (node 5)`, counted from 1; without the node where none is known."""
         return (
             f"drive {drive + 1} (node {self._nodes[drive]})"
             if self._nodes and 0 <= drive < self._n
@@ -148,7 +147,7 @@ class Inspector:
                 raise InputError(f"readings.{name} has shape {shape}; the robot has {self._n} drives.")
 
     def lasting(self, now: float, readings: Readings, camera: CameraWatch | None) -> Iterator[Fault]:
-        """What is wrong for as long as it is: only its end makes the robot fit to move again."""
+        """Return what is wrong for as long as it is: only its end makes the robot fit to move again."""
         # readings may be looked at twice: they have aged since
         limits, old = self._limits, max(now - readings.t, 0.0)
         if readings.foreign_syncs:
@@ -201,8 +200,8 @@ class Inspector:
             yield Fault(kind="marker lost", sentence=sentence, t=now)
 
     def drives(self, now: float, readings: Readings) -> Iterator[Fault]:
-        """What drives say of themselves: emergency messages and faults. A drive keeps its fault until it is
-        reset."""
+        """Return what drives say of themselves: emergency messages and faults. A drive keeps its fault
+        until it is reset."""
         for message in readings.emergencies:
             if message.code & 0xFF00 == 0:
                 continue  # 00xx reports that an error is gone
@@ -218,7 +217,8 @@ class Inspector:
         yield from self._state((readings.statusword & FAULT) != 0, readings.statusword, now)
 
     def powered(self, now: float, readings: Readings, before: Readings | None) -> Iterator[Fault]:
-        """What is wrong only while drives are enabled; `before` is the cycle before, None for the first."""
+        """Return what is wrong only while drives are enabled; `before` is the cycle before, None for the
+        first."""
         limits = self._limits
         yield from self._state(
             (readings.statusword & STATE_MASK) != OPERATION_ENABLED, readings.statusword, now

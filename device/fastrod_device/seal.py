@@ -1,4 +1,4 @@
-"""What is hidden in the emulated robot: drawn from a seed, and shut until the judge opens it."""
+"""Effects that are hidden in the emulated robot: drawn from a seed, and shut until the judge opens it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fastrod_device.plant_rod import EI, GJ, LENGTH, OFFSET
 KINDS = ("backlash", "friction", "tendon_stretch", "creep", "gravity", "latency")
 """One of them comes out of a draw."""
 NAMES = (*KINDS, "none", "outside")
-"""What can be asked for by name; "outside" is something that no library of effects has."""
+"""Names of the seals that can be requested; "outside" is something that no library of effects has."""
 _DEGREE = math.pi / 180.0
 
 
@@ -48,7 +48,8 @@ class Seal:
         return {name: dict(numbers) for name, numbers in self.__inside.items()}
 
     def stiffness(self) -> tuple[float, float]:
-        """Of the body in bending and torsion [N m^2]: no effect, but a number that nobody measured."""
+        """Stiffness of the body in bending and torsion [N m^2]: no effect, but a number that nobody
+        measured."""
         return self.__stiffness
 
 

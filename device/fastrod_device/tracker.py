@@ -52,7 +52,7 @@ _GAUSS = 1.0 / math.sqrt(3.0)  # two points that weigh on a line as much as all 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MarkerSighting:
-    """What one frame says about the tip; nan where it says nothing."""
+    """Sighting of the tip's marker in one frame; nan where it says nothing."""
 
     t: float
     """The frame's [s]; where its stamp is not believed, a time between those of its neighbours."""
@@ -133,8 +133,8 @@ class MarkerTracker:
     def look(
         self, frame: CameraFrame, expected: Pose | None = None, *, now: float | None = None
     ) -> MarkerSighting:
-        """What the frame says. `expected`: base_from_tip by a model, position (3,) [m] and quaternion (4,),
-        by which both solutions are judged; `now`: the clock [s], None where frames may have any stamp.
+        """Return what the frame says. `expected`: base_from_tip by a model, position (3,) [m] and quaternion
+        (4,), by which both solutions are judged; `now`: the clock [s], None where frames may have any stamp.
 
         A frame is "frozen" where its number or its whole image is that of the frame before, "repeated" where
         its image is an older one's, "out of order" where its stamp or number runs back, and "from the future"
@@ -291,7 +291,7 @@ class MarkerTracker:
         return position, -quaternion if quaternion[0] < 0.0 else quaternion
 
     def _belief(self, t: float, quaternion: Floats, expected: Pose | None) -> float:
-        """What a solution costs by its angles to the last sighting and to the expected pose."""
+        """Return what a solution costs by its angles to the last sighting and to the expected pose."""
         cost = 0.0
         if self._last is not None:
             sigma = _LAST_ANGLE + _SPIN * abs(t - self._last.t)

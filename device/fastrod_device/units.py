@@ -21,7 +21,7 @@ _RANGE = {
     "rated_torque": (1e-6, 1e4),
     "efficiency": (1e-3, 1.0),
 }
-"""Of a `DriveSpec`'s numbers: wide of every drive, and their products still are counts and newtons."""
+"""Ranges of a `DriveSpec`'s numbers: wide of every drive, and their products still are counts and newtons."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +41,13 @@ class DriveSpec:
     gear: float = 21.0
     """Turns of the motor in one turn of the drum."""
     counts_per_turn: int = 4096
-    """Of the motor's encoder, edges of both channels counted."""
+    """Counts per turn of the motor's encoder, edges of both channels counted."""
     torque_constant: float = 0.0251
-    """Of the motor [N m/A]."""
+    """Torque constant of the motor [N m/A]."""
     rated_torque: float = 0.054
-    """Of the motor [N m]; CiA 402 counts torque in thousandths of it."""
+    """Rated torque of the motor [N m]; CiA 402 counts torque in thousandths of it."""
     efficiency: float = 0.8
-    """Of the gear, 0 to 1: what of the motor's torque reaches the drum."""
+    """Efficiency of the gear, 0 to 1: what of the motor's torque reaches the drum."""
 
     def __post_init__(self) -> None:
         if isinstance(self.node, bool) or not isinstance(self.node, int) or not 1 <= self.node <= 126:
@@ -135,7 +135,7 @@ class Transmission:
         return np.asarray(torque * self._torque * self._amperes, dtype=np.float64)
 
     def readings(self, feedback: DriveFeedback) -> Readings:
-        """What drives say, in SI units."""
+        """Return the drives' readings in SI units."""
         return Readings(
             t=feedback.t,
             dl=self.dl(feedback.position),

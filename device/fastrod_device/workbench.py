@@ -22,7 +22,7 @@ from fastrod_device.prototype import Prototype
 from fastrod_device.seal import seal
 
 _SCATTER = 0.08
-"""How far the stiffnesses of an emulated body may be from the robot file's, as a part."""
+"""Scatter of an emulated body's stiffnesses about the robot file's, as a fraction."""
 _COUNT = itertools.count(1)
 
 
@@ -44,7 +44,7 @@ class BoardBench:
     assistant: BoardMover
     clock: Clock
     truth: Camera | None
-    """What an emulated camera is and where it stands; None where it is real."""
+    """True lens and pose of an emulated camera; None where it is real."""
 
 
 @contextmanager

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 BASE_FIT = "base fit: "
-"""How the sentence begins that `identify` says once its base model is fitted."""
+"""Beginning of the sentence that `identify` prints once its base model is fitted."""
 _SMALL = 0.3  # of the steps of a preset: fewer are worth a word
 _PATIENCE = 10.0  # s without a line
 
@@ -444,8 +444,8 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
 
 @contextmanager
 def _folder(out: Path | None) -> Iterator[None]:
-    """Of what is about to be computed, made before rather than after; gone again where nothing comes of
-    it."""
+    """Make the folder of what is about to be computed before rather than after; gone again where nothing
+    comes of it."""
     from fastrod.logs.folder import make_folder
 
     fresh = out is not None and not out.exists()

@@ -374,7 +374,7 @@ def _put_camera(out: Path, arguments: argparse.Namespace) -> str:
 
 
 def _device(arguments: argparse.Namespace) -> int | str | None:
-    """Of the camera; None: without."""
+    """Return the number or path of the camera; None: without."""
     given = arguments.camera or "0"
     return None if given == "none" else int(given) if given.isdigit() else str(given)
 

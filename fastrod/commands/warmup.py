@@ -69,7 +69,7 @@ GROUPS: Mapping[str, tuple[Callable[[], Iterator[None]], int]] = {
     "contact": (_contact, 2),
     "modes": (_modes, 2),
 }
-"""What each group runs, and in how many steps; contact also compiles what it needs of the rod."""
+"""Kernels of each group, and its number of steps; contact also compiles what it needs of the rod."""
 
 
 def warm_up(groups: Sequence[str] = (), progress: Progress | None = None) -> None:

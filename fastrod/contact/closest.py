@@ -118,7 +118,7 @@ def corner(depth: tuple[float, ...], outward: tuple[Triple, ...]) -> Signed:
 
 
 def lowest(at: Callable[[float], float]) -> float:
-    """Where a convex function is least between 0 and 1, by golden section."""
+    """Return where a convex function is least between 0 and 1, by golden section."""
     low, high = 0.0, 1.0
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     f_left, f_right = at(left), at(right)

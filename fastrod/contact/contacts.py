@@ -20,7 +20,7 @@ class Contacts:
     force."""
 
     names: tuple[str, ...]
-    """Of the obstacles; then come the rods of the robots, `rod 0`, `rod 1`, ..."""
+    """Names of the obstacles; then come the rods of the robots, `rod 0`, `rod 1`, ..."""
     count: Ints
     """(n_robots,)"""
     obstacle: Ints

@@ -68,13 +68,13 @@ class SegmentClosest(NamedTuple):
     on_segment: Floats
     """(3,) on the segment, world [m]."""
     fraction: float
-    """Where `on_segment` is: 0 at a, 1 at b."""
+    """Fraction along the segment at which `on_segment` lies: 0 at a, 1 at b."""
     face: int
     """Index of the face in `Obstacle.faces`, -1 for a primitive."""
 
 
 class _Mesh:
-    """What a mesh needs for its queries, in the obstacle frame: shared by all scenes."""
+    """A mesh prepared for queries, in the obstacle frame: shared by all scenes."""
 
     def __init__(self, obstacle: Obstacle) -> None:
         corner = obstacle.vertices[obstacle.faces]
@@ -161,7 +161,8 @@ def _distance_by_fcl(size: Triple, p: Triple) -> tuple[float, Triple]:
 
 @cache
 def address() -> int:
-    """Of the distance by FCL for kernels (`Surfaces.primitive`); `size[0]` is `number_of` the mesh."""
+    """Address of the distance by FCL for kernels (`Surfaces.primitive`); `size[0]` is `number_of` the
+    mesh."""
     return pointed(_distance_by_fcl, DISTANCE, nogil=False)[1]
 
 

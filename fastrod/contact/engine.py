@@ -1,4 +1,4 @@
-"""What contact remembers between steps, and what it knows of rods and obstacles in one pass."""
+"""Memory of contact between steps, and its view of rods and obstacles in one iteration."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MOST_POINTS = 64  # contacts of a kept one: 1.2 MB a thread; of a larger one th
 
 
 class ContactSnapshot(NamedTuple):
-    """What an `Engine` remembers."""
+    """Saved memory of an `Engine`."""
 
     contact_set: ContactSet
     clearance: Clearance
@@ -60,7 +60,7 @@ class ContactSnapshot(NamedTuple):
 
 
 class Engine:
-    """What contact remembers between steps. Rows are robots' indices; arrays have the robot axis first."""
+    """Memory of contact between steps. Rows are robots' indices; arrays have the robot axis first."""
 
     def __init__(
         self, scene: ContactScene, rods: ContactRods, length: Floats, n_points: int, threads: int
@@ -79,7 +79,7 @@ class Engine:
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
         self.trouble = np.zeros(n, TROUBLE)
-        """What kept each robot from rest in its last iteration."""
+        """Cause that kept each robot from rest in its last iteration."""
         self.continued = np.zeros(n, bool)
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
@@ -88,8 +88,8 @@ class Engine:
         self._workspace: dict[tuple[int, ...], tuple[ContactProblem, SearchWork]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What `pickle` and `copy` take: a workspace holds nothing between two iterations, and two engines
-        never share one."""
+        """Return what `pickle` and `copy` take: a workspace holds nothing between two iterations, and two
+        engines never share one."""
         return {**self.__dict__, "_workspace": {}, "_broad": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -247,7 +247,7 @@ class Engine:
         return ports
 
     def why(self, i: int, done: float) -> ProblemSentence:
-        """What stopped robot i, which came the fraction `done` of its step."""
+        """Return what stopped robot i, which came the fraction `done` of its step."""
         gap = self.clearance.gap[i]
         if self.trouble[i].cause == NOTHING:
             if gap < 0.0:

@@ -1,4 +1,4 @@
-"""What a rod can touch: `Obstacle`, checked once, and `mesh` and `obstacle`, which make one.
+"""Geometry that a rod can touch: `Obstacle`, checked once, and `mesh` and `obstacle`, which make one.
 
 >>> ball = obstacle("sphere", (0.02,), position=(0.0, 0.0, 0.1), friction=0.3)
 >>> ball.name, ball.shape, ball.size

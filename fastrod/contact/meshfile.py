@@ -30,21 +30,21 @@ _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
 
 @dataclass(frozen=True, kw_only=True)
 class MeshLimits:
-    """What reading a mesh file may cost, for `fastrod.contact.mesh`. Raises `InputError` for one that is not
-    positive.
+    """Limits on the cost of reading a mesh file, for `fastrod.contact.mesh`. Raises `InputError` for one that
+    is not positive.
 
     >>> MeshLimits(n_faces=5_000_000, seconds=60.0).n_bytes
     256000000
     """
 
     n_bytes: int = 256_000_000
-    """Of the file."""
+    """Largest size of the file [bytes]."""
     n_faces: int = 1_000_000
     """Triangles of all its bodies, with each instance counted."""
     seconds: float = 10.0
     """Until a file of more than 4 MB, or of more than 100 bodies, must be read; smaller ones take less."""
     memory: int = 2_000_000_000
-    """Of the process that reads such a file [bytes]."""
+    """Memory of the process that reads such a file [bytes]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -58,7 +58,7 @@ class MeshLimits:
 
 
 class _Declared(NamedTuple):
-    """What a file says that it holds."""
+    """Size that a file declares."""
 
     faces: int
     vertices: int

@@ -53,7 +53,7 @@ class Primitive:
     """Principal curvatures of the distance at a point outside: rotation of the normal per length as p moves
     across the unit direction that is returned, and along it [1/m]."""
     radius: Callable[[Triple], float]
-    """Of the ball about its origin that holds a shape of this size; inf where none does [m]."""
+    """Radius of the ball about its origin that holds a shape of this size; inf where none does [m]."""
     width: Callable[[Triple], float]
     """The longest edge of its box [m]."""
     drawing: Callable[[Any, Triple], Any]
@@ -81,7 +81,7 @@ class Primitive:
 
     @cached_property
     def addresses(self) -> tuple[int, int]:
-        """Of the compiled distance and curvature in this process, for the kernels."""
+        """Addresses of the compiled distance and curvature in this process, for the kernels."""
         return self._distance[1], self._compiled("curvature", self.curvature, CURVATURE)[1]
 
     @property

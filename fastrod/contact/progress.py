@@ -18,7 +18,7 @@ _REFUSED = 4.0  # of the damping, after a pass that was taken back
 
 
 class Progress:
-    """How far robots are from rest, pass by pass."""
+    """Distance of robots from rest, iteration by iteration."""
 
     def __init__(self, n: int) -> None:
         self.nearest = np.full(n, np.inf)
@@ -27,7 +27,7 @@ class Progress:
         """(n_robots,) passes since a robot came closer."""
 
     def note(self, rows: Ints, far: Floats) -> None:
-        """How `far` these robots are from rest now [m]."""
+        """Note how `far` these robots are from rest now [m]."""
         closer = far < _CLOSER * self.nearest[rows]
         self.idle[rows] = np.where(closer, 0, self.idle[rows] + 1)
         self.nearest[rows] = np.where(closer, far, self.nearest[rows])

@@ -20,7 +20,7 @@ _MOST_SPLITS = 400  # of the way between two states: a bound on time
 
 
 class Hits(NamedTuple):
-    """What rays meet."""
+    """Hits of rays on obstacles."""
 
     distance: Floats
     """(n_robots, n_rays) from the origin to the nearest surface; inf where none is met [m]."""

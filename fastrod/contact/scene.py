@@ -51,9 +51,9 @@ class ContactScene:
     """Iterations after which a step that cannot be solved is given up: fewer where many robots wait for one,
     as in training."""
     collision: Literal["bvh", "fcl", "auto"] = "auto"
-    """Who measures distances to meshes, with the same loads: "bvh", a compiled search for batches; "fcl",
-    FCL, one query at a time; "auto" is the cheaper one, which is "bvh" from one robot on (`fastrod bench
-    contact`)."""
+    """Method that measures distances to meshes, with the same loads: "bvh", a compiled search for batches;
+    "fcl", FCL, one query at a time; "auto" is the cheaper one, which is "bvh" from one robot on (`fastrod
+    bench contact`)."""
 
     def __post_init__(self) -> None:
         obstacles = (self.obstacles,) if isinstance(self.obstacles, Obstacle) else tuple(self.obstacles)
@@ -126,7 +126,7 @@ class ContactScene:
         return np.asarray(np.unique(worlds, return_inverse=True)[1], dtype=np.int64)
 
     def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> ContactRods:
-        """What contact needs to know of the robots of a simulator."""
+        """Return what contact needs to know of the robots of a simulator."""
         radius = np.array([self.radius_of(robot) for robot in robots])
         length = np.array([robot.length for robot in robots])
         first = 1.5 * radius[:, 0] if self.mounting is None else np.full(len(robots), self.mounting)
@@ -156,7 +156,8 @@ class ContactScene:
         )
 
     def radius_of(self, robot: Robot) -> list[float]:
-        """Of each segment of a robot in this scene [m]; `InputError` where `rod_radius` does not fit it."""
+        """Return the radius of each segment of a robot in this scene [m]; `InputError` where `rod_radius`
+        does not fit it."""
         if self.rod_radius is None:
             return [
                 segment.body_radius

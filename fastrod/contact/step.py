@@ -44,7 +44,8 @@ _CURVE = ("position", "rotation", "curvature", "arclength")  # what contact read
 
 
 class ContactSolver(Protocol):
-    """What contact needs of the rods' solver; `fastrod.solver.contact_solver` is the one that there is."""
+    """Interface of the rods' solver that contact needs; `fastrod.solver.contact_solver` is the one that
+    there is."""
 
     @property
     def x(self) -> Floats:
@@ -76,7 +77,7 @@ class ContactStep:
     shape: RodShape
     end: Ports
     tolerance: float
-    """Of motion, residual and violation at rest [m]."""
+    """Tolerance of motion, residual and violation at rest [m]."""
     most: int
     """Passes of a warm robot, about: a step ends."""
 

@@ -1,4 +1,4 @@
-"""What kept a rod from rest, in words."""
+"""Sentences on what kept a rod from rest."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class ResolvedRate:
     """
 
     gain: float = 1.0
-    """Of the error [1/s]."""
+    """Gain of the error [1/s]."""
     damping: float = 1e-2
     """Largest damping l, at a singular Jacobian; the unit of the weighted Jacobian. 0: none."""
     threshold: float | None = None
@@ -55,10 +55,10 @@ class ResolvedRate:
     posture: ArrayLike | None = None
     """(n_q,) where q goes as far as the task leaves it free; None: nowhere."""
     posture_gain: float = 1.0
-    """Of posture - q [1/s]."""
+    """Gain of `posture - q` [1/s]."""
     nearest: bool = False
-    """Of all rates within the limits, those of least |J q_dot - task|^2 + damping^2 sum of weight q_dot^2:
-    what is beyond the limits is followed partly, in any direction. False: the direction is kept."""
+    """Nearest rates: of all within the limits, those of least |J q_dot - task|^2 + damping^2 sum of weight
+    q_dot^2: what is beyond the limits is followed partly, in any direction. False: the direction is kept."""
     _n_q: int | None = field(init=False, repr=False, default=None)
     _most: Floats = field(init=False, repr=False)
     """(n_q,) or one number: `rate`, infinite where there is none."""

@@ -28,7 +28,7 @@ class Trajectory:
 
     name: str
     period: float
-    """Of one lap [s]; a path in the plane is then back where it began."""
+    """Time of one lap [s]; a path in the plane is then back where it began."""
     center: tuple[float, float, float]
     """World [m]."""
     path: Path

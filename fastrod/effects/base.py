@@ -1,5 +1,5 @@
-"""What an effect is: a physical law that the rod lacks, applied at a seam of the model; and the registry of
-effects.
+"""Definition of an effect: a physical law that the rod lacks, applied at a seam of the model; and the
+registry of effects.
 
 An effect is a frozen class with `seam`, `parameters`, `memory` and `apply`, and a docstring that gives its
 *Equation*,
@@ -35,7 +35,7 @@ Of = Literal["", "offset", "length", "1/offset", "1/offset^2"]
 
 
 class Seam(Enum):
-    """Where an effect enters, from motor to camera; effects act in this order."""
+    """Seam at which an effect enters, from motor to camera; effects act in this order."""
 
     ACTUATION = 1
     """Between the commanded tendons and those that the rod feels: `tendon_length`, `extension`, `offset`,
@@ -43,13 +43,13 @@ class Seam(Enum):
     MATERIAL = 2
     """The rod itself: `stiffness`, `precurvature`."""
     LOAD = 3
-    """What pushes it: `tip_force`, `tip_moment`, `line_force`."""
+    """Loads: `tip_force`, `tip_moment`, `line_force`."""
     SENSING = 4
     """Between the true tip and the measured one: `tip_position`, `tip_rotation`, `points`."""
 
 
 class Signal(Enum):
-    """What an effect's residual is drawn against in a report."""
+    """Quantity against which an effect's residual is drawn in a report."""
 
     TIME = "time since the start of the run"
     MOTION = "speed of the tip"
@@ -91,10 +91,11 @@ class Parameter:
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
     own."""
     shared: bool = False
-    """Of one per drive. True: drives are alike unless one is worn, so a fit has one number for all, or one
-    drive alone."""
+    """Whether a parameter that exists once per drive is fitted as one number. True: drives are alike
+    unless one is worn, so a fit has one number for all, or one drive alone."""
     apart: bool = False
-    """Of one per segment. True: segments differ, so a fit has a number for each."""
+    """Whether a parameter that exists once per segment is fitted as one number each. True: segments
+    differ, so a fit has a number for each."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -151,7 +152,8 @@ class Parameter:
 
 @runtime_checkable
 class Effect(Protocol):
-    """What `@effect` requires of a class. Optional: the attributes of `Law`, and `sweep` (see `Operator`)."""
+    """Interface that `@effect` requires of a class. Optional: the attributes of `Law`, and `sweep` (see
+    `Operator`)."""
 
     seam: ClassVar[Seam]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -169,7 +171,7 @@ class Effect(Protocol):
 
 
 class Law:
-    """What identification and its report know of an effect; each attribute may be left out."""
+    """Description of an effect for identification and its report; each attribute may be left out."""
 
     order: ClassVar[float] = 50.0
     """Place among the effects of the same seam, from the motor to the camera."""
@@ -182,7 +184,7 @@ class Law:
     separated_by: ClassVar[Mapping[str, str]] = {}
     """The run that separates it from another effect, by the other's name; either of two may say it."""
     signal: ClassVar[Signal | None] = None
-    """What its residual is drawn against; None: what its seam suggests."""
+    """Quantity against which its residual is drawn; None: what its seam suggests."""
     least_segments: ClassVar[int] = 1
     """A robot with fewer segments cannot show it."""
     frequent: ClassVar[bool] = False
@@ -198,8 +200,8 @@ class Law:
     """It reads `ports.solved_tension`. In a step of a simulator that is of the last state; `settle` and a log
     solve it together with the rod."""
     on_forces: ClassVar[bool] = False
-    """Of ACTUATION: it acts on forces of tendons, where these are the commands, as it does on lengths. Any
-    other leaves such a robot's commands as they are."""
+    """Whether an ACTUATION effect acts on the tendons' forces where these are the commands, as it does on
+    lengths. Any other leaves such a robot's commands as they are."""
     reads_bend: ClassVar[bool] = False
     """It reads `ports.solved_bend`, what the rod makes of its tendons: with it the bend, not the command, has
     a memory. When it is of which state, as with `reads_tension`."""
@@ -218,7 +220,7 @@ def trait(what: Effect, name: str) -> Any:
 
 
 def signal_of(what: Effect) -> Signal:
-    """What an effect's residual is drawn against."""
+    """Return what an effect's residual is drawn against."""
     given: Signal | None = trait(what, "signal")
     if given is not None:
         return given
@@ -277,7 +279,7 @@ class BodyOperator(Law):
     elements: ClassVar[int] = 1
 
     def memory(self, n_robots: int, n_bends: int) -> Floats:
-        """Where each element has been dragged to [rad]; nan: it is at rest at the first bend."""
+        """Return where each element has been dragged to [rad]; nan: it is at rest at the first bend."""
         return np.full((n_robots, self.elements * n_bends), np.nan)
 
     def sweep(self, values: Floats, memory: Floats, bend: Floats) -> Floats:

@@ -20,7 +20,7 @@ from fastrod.types import Flags, Floats, Ints
 
 
 class SensedPoses(NamedTuple):
-    """What a camera on the base sees of the tip, effects of sensing included; base frame."""
+    """Poses of the tip as a camera on the base sees it, effects of sensing included; base frame."""
 
     tip_position: Floats
     """(n_robots, 3) [m]."""
@@ -87,8 +87,9 @@ def reads_bend(what: Effect) -> bool:
 
 
 def tip_feedback(links: Sequence[Link], opened: EffectPorts, tip: Floats) -> tuple[Floats, Floats]:
-    """What effects that feel the tip do where it is at `tip` (n, 3), base frame [m]: their tip force (n, 3)
-    [N] and its slopes by the tip (n, 3, 3) [N/m], force in the world frame. `opened` stays as it is."""
+    """Return what effects that feel the tip do where it is at `tip` (n, 3), base frame [m]: their tip
+    force (n, 3) [N] and its slopes by the tip (n, 3, 3) [N/m], force in the world frame. `opened` stays as
+    it is."""
 
     def force(at: Floats) -> Floats:
         opened.tip_position, opened.tip_force = at, np.zeros_like(given)

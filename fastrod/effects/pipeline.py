@@ -140,8 +140,8 @@ class EffectPipeline:
         compliance: Floats | None = None,
         again: bool = False,
     ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
-        """What the kernel reads at this step, and the point forces of effects (`close_ports`). Memories move
-        on, but for the robots `skip`, whose inputs cannot be used.
+        """Return what the kernel reads at this step, and the point forces of effects (`close_ports`).
+        Memories move on, but for the robots `skip`, whose inputs cannot be used.
 
         `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
         Effects that feel the tip read it from `state`, and `compliance` (n_robots, 3, 3) [m/N], world, says

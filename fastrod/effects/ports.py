@@ -270,8 +270,8 @@ def driven(opened: EffectPorts, ports: Ports) -> tuple[Floats, Floats]:
 def close_ports(
     opened: EffectPorts, ports: Ports, params: Params
 ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
-    """What the kernel reads, from ports that effects have changed, and the point forces (arclength (n,) [m],
-    force (n, 3) world [N]) that they have added."""
+    """Return what the kernel reads, from ports that effects have changed, and the point forces (arclength
+    (n,) [m], force (n, 3) world [N]) that they have added."""
     precurvature = np.ascontiguousarray(opened.precurvature)
     if opened.rest_bend.any():
         precurvature = precurvature.copy()

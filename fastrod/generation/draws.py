@@ -18,7 +18,7 @@ from fastrod.model.routing import route
 from fastrod.types import Floats
 
 _SPREAD = (0.5, 1.5)
-"""Of the typical size."""
+"""Fraction of the typical size."""
 
 
 def robot_of(text: object) -> Robot:

@@ -43,7 +43,7 @@ class Plan:
     shard_rows: int = 0
     """0 stands for the usual number."""
     version: str = ""
-    """Of fastrod; empty stands for this one."""
+    """Version of fastrod; empty stands for this one."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.work, tuple(KINDS.values())):
@@ -74,7 +74,7 @@ class Plan:
 
     @property
     def hash(self) -> str:
-        """Of everything but the count: a data set may grow."""
+        """Hash of everything but the count: a data set may grow."""
         record = json.dumps({**self.record(), "count": None}, sort_keys=True)
         return hashlib.sha256(record.encode()).hexdigest()[:32]
 

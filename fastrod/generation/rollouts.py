@@ -31,8 +31,8 @@ class Rollouts:
     policy: str = "random"
     """Policy that acts: one of `POLICIES`."""
     options: tuple[tuple[str, Any], ...] = ()
-    """Of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes the file's
-    text, so that the data set hangs on no file that may change."""
+    """Options of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes
+    the file's text, so that the data set hangs on no file that may change."""
 
     def __post_init__(self) -> None:
         from fastrod_envs.policies import find

@@ -39,11 +39,11 @@ class Summary:
     """Rows or episodes that did not succeed; they are there, and marked."""
     shards: int
     made: int
-    """Of these, by this run."""
+    """Shards made by this run."""
     made_count: int
     """Rows or episodes of those."""
     seconds: float
-    """Of this run, start and check included."""
+    """Duration of this run, start and check included [s]."""
     bytes: int
 
     @property

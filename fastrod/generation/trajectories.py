@@ -39,7 +39,7 @@ class Trajectories:
     effects: tuple[str, ...] = ()
     """Drawn for each episode (`fastrod.generation.draws`)."""
     steps: int = 200
-    """Of an episode."""
+    """Number of steps of an episode."""
     dt: float = 0.02
     """[s]."""
     bend: float = 0.9
@@ -186,11 +186,11 @@ class Trajectories:
 
     @property
     def _steps(self) -> int:
-        """Of the simulator, from row to row."""
+        """Number of steps of the simulator from row to row."""
         return max(1, math.ceil(self.dt / _MOTION - 1e-9)) if self.dynamics else 1
 
     def _simulator(self, robot: Robot | list[Robot], count: int) -> Simulator:
-        """Of `count` robots. Raises `InputError` where they cannot move."""
+        """Simulator of `count` robots. Raises `InputError` where they cannot move."""
         return Simulator(
             robot,
             count,

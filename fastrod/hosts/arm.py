@@ -39,7 +39,7 @@ class BulletArm:
         self._chain = _chain(b, body, self.tip)
         known = {b.getJointInfo(body, j)[1].decode(): k for k, j in enumerate(self._chain.joint)}
         self.names: tuple[str, ...] = tuple(known) if joints is None else tuple(joints)
-        """Of the joints."""
+        """Names of the joints."""
         if not self.names or len(set(self.names)) < len(self.names):
             raise HostError(
                 f"the arm's joints are {list(self.names)!r}; name at least one between base and "

@@ -68,7 +68,7 @@ class BodyContact(ABC):
 
     @abstractmethod
     def com(self) -> Motion:
-        """Of the centre of mass' frame now."""
+        """Motion of the centre of mass' frame now."""
 
     @abstractmethod
     def overlap(self, capsules: Sequence[int]) -> Floats:

@@ -81,7 +81,7 @@ class CarriedRod(ABC):
     @final
     @property
     def simulator(self) -> Simulator:
-        """Of the rod."""
+        """Simulator of the rod."""
         return self.rod.simulator
 
     @final

@@ -22,7 +22,7 @@ class Motion(NamedTuple):
 
 
 class Freedom(NamedTuple):
-    """How a body gives way to a rod within a step; several bodies have an axis before."""
+    """Compliance of a body to a rod within a step; several bodies have an axis before."""
 
     inverse_inertia: Floats
     """(6, 6) J M^-1 J^T: linear and angular acceleration of the base by force and moment there, world; 0 of
@@ -36,7 +36,7 @@ class Host(Protocol):
     """A rigid body that a rod stands on: its motion goes into the rod, the rod's wrench goes into it."""
 
     def motion(self) -> Motion:
-        """Of the rod's base: origin at the first node, z along the rod."""
+        """Motion of the rod's base: origin at the first node, z along the rod."""
 
     def freedom(self, dt: float) -> Freedom:
         """In the host's next step, of `dt` [s]."""

@@ -50,7 +50,7 @@ class BulletLink:
         self._position, self._quaternion = mount_pose(position, quaternion)
 
     def motion(self) -> Motion:
-        """Of the rod's base."""
+        """Motion of the rod's base."""
         pose, velocity = link_motion(self.bullet, self.body, self.link)
         arm = matrix_from_quaternion(pose[None, 3:])[0] @ self._position
         velocity[:3] += np.cross(velocity[3:], arm)
@@ -83,7 +83,8 @@ class BulletLink:
         return jacobian @ np.linalg.solve(np.array(bullet.calculateMassMatrix(self.body, q)), jacobian.T)
 
     def _alone(self, point: Floats) -> Floats:
-        """Of the link, or the nearest before it that has a mass, as if nothing were joined to it."""
+        """Mobility of the link, or of the nearest before it that has a mass, as if nothing were joined to
+        it."""
         bullet, link = self.bullet, self.link
         while link >= 0 and bullet.getDynamicsInfo(self.body, link)[0] == 0.0:
             link = bullet.getJointInfo(self.body, link)[16]
@@ -102,7 +103,7 @@ class BulletLink:
 
 
 def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
-    """Of a link's URDF frame."""
+    """Motion of a link's URDF frame."""
     pose, velocity = com_motion(bullet, body, link)
     inertial = bullet.getDynamicsInfo(body, link)
     # com_from_frame, for bodies whose mass is off their origin
@@ -113,7 +114,7 @@ def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
 
 
 def com_motion(bullet: Bullet, body: int, link: int) -> Motion:
-    """Of the frame of a link's centre of mass."""
+    """Motion of the frame of a link's centre of mass."""
     if link < 0:
         position, quaternion = bullet.getBasePositionAndOrientation(body)
         linear, angular = bullet.getBaseVelocity(body)

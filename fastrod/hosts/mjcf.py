@@ -206,8 +206,8 @@ def _site_lines(sites: list[tuple[str, float, float, float]], pad: int) -> Itera
 
 
 def _jumps(robot: Robot) -> list[float]:
-    """What a tendon's path has between segments in which it lies elsewhere, which fastrod does not count
-    [m]."""
+    """Return what a tendon's path has between segments in which it lies elsewhere, which fastrod does not
+    count [m]."""
     made = []
     for tendon, end in zip(robot.tendons, robot.tendon_segment, strict=True):
         places = tendon.position(int(end) + 1)

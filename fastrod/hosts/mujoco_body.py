@@ -75,7 +75,7 @@ def velocity_of(model: Any, data: Any, body: int, *, com: bool) -> Floats:
 
 
 def com_motion(model: Any, data: Any, body: int) -> Motion:
-    """Of the frame of a body's centre of mass, as `data` have it."""
+    """Motion of the frame of a body's centre of mass, as `data` have it."""
     orientation = quaternion_from_matrix(data.ximat[body].reshape(1, 3, 3))[0]
     return Motion(np.concatenate([data.xipos[body], orientation]), velocity_of(model, data, body, com=True))
 
@@ -136,11 +136,11 @@ class MujocoBody:
         self._position, self._quaternion = mount_pose(position, quaternion)
         self._applied = Applied(data, self.body)
         self.mocap_velocity: Floats = np.zeros(6)
-        """Of the body's frame, linear [m/s] and angular [rad/s], world: for a mocap body, which MuJoCo itself
-        takes to be at rest."""
+        """Velocity of the body's frame, linear [m/s] and angular [rad/s], world: for a mocap body, which
+        MuJoCo itself takes to be at rest."""
 
     def motion(self) -> Motion:
-        """Of the rod's base, with the joints as they are now."""
+        """Motion of the rod's base, with the joints as they are now."""
         refresh(self.model, self.data)
         pose = self._base()
         velocity = velocity_of(self.model, self.data, self.body, com=False)

@@ -44,7 +44,8 @@ class MujocoBodyContact(BodyContact):
         )
 
     def com(self) -> Motion:
-        """Of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's inertia."""
+        """Motion of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's
+        inertia."""
         return com_motion(self.model, self.data, self.body)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:

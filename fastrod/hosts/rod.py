@@ -59,7 +59,7 @@ class RodSnapshot(NamedTuple):
     still: Flags
     """(n_robots,) robots that came to rest: they begin with their base's motion."""
     carried: Motion
-    """Where the rod's mass takes its base to be, and how it takes it to move."""
+    """Base and velocity that the rod's mass assumes."""
 
 
 @final

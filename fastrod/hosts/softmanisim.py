@@ -109,11 +109,11 @@ class SoftManiSim:
             self.bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
             self.plane_id = self.bullet.loadURDF("plane.urdf")
         self.camera = HostCamera(near=0.05, far=5.0)
-        """Of `capture_image`; set another to change it."""
+        """Camera of `capture_image`; set another to change it."""
         self.view = CameraView(eye=(0.65, 0.35, 0.45), target=(0.0, 0.15, 0.08))
         """Position and target of that camera, world; set another to change it."""
         self.in_hand_camera = HostCamera(near=0.005, far=3.0)
-        """Of `in_hand_camera_capture_image`."""
+        """Camera of `in_hand_camera_capture_image`."""
         self._colors = (
             numbers("body_color", body_color, 4).tolist(),
             numbers("head_color", head_color, 4).tolist(),

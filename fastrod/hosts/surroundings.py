@@ -35,7 +35,7 @@ class BulletBodyContact(BodyContact):
         super().__init__(shapes, mass, np.asarray(inertia), dt=dt, relaxation=relaxation, friction=friction)
 
     def com(self) -> Motion:
-        """Of the centre of mass' frame, not of the link's URDF frame."""
+        """Motion of the centre of mass' frame, not of the link's URDF frame."""
         return com_motion(self.bullet, self.body, self.link)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:

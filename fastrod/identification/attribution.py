@@ -220,8 +220,8 @@ def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
 def _rings(
     log: SplitLog, robot: Robot, progressed: Callable[[str, int, int], None], threads: int | None
 ) -> Result | None:
-    """What the model at rest lacks of a robot with a mass that was let go: inertia and damping; None where it
-    was not, or where these do not explain much."""
+    """Return what the model at rest lacks of a robot with a mass that was let go: inertia and damping;
+    None where it was not, or where these do not explain much."""
     if log.swings is None:
         return None
     log = log.swings
@@ -250,7 +250,7 @@ def _in_motion(
     progressed: Callable[[str, int, int], None],
     threads: int | None,
 ) -> Result:
-    """What the model of `robot` in motion lacks: damping, where its file has none, then effects."""
+    """Return what the model of `robot` in motion lacks: damping, where its file has none, then effects."""
     most, log = max_effects + _SPARE + 2, log.swings or log
 
     def fitted(model: Model, robot: Robot) -> BaseFit:
@@ -283,8 +283,8 @@ def _found(
     progressed: Callable[[str, int, int], None],
     threads: int | None,
 ) -> tuple[SplitLog, BaseFit, SearchOutcome]:
-    """What the search finds, with log and base fit of the tendons that it goes on with. Raises `LogError`
-    where the model does not follow the log, as the sentence `guess` may say."""
+    """Return what the search finds, with log and base fit of the tendons that it goes on with. Raises
+    `LogError` where the model does not follow the log, as the sentence `guess` may say."""
     most = max_effects + _SPARE + 2
 
     def other_tendons(base: BaseFit, below: float) -> tuple[SplitLog, BaseFit]:
@@ -335,7 +335,7 @@ def _searched(
     progressed: Callable[[str, int, int], None],
     first: tuple[SearchStep, float] | None = None,
 ) -> SearchOutcome:
-    """What the search finds beside a base model, and needs."""
+    """Return what the search finds beside a base model, and needs."""
     return _needed(base, _candidates(base, max_effects, progressed, first), max_effects)
 
 

@@ -26,7 +26,7 @@ _HOLD = 4.0  # s
 _RANDOM = 10.0  # s
 _REPEAT = 20.0  # s of the first block, at the end
 _RANGES = {"bend": (0.01, 3.0), "rate": (0.5, 1000.0), "speed": (0.01, 100.0)}
-"""What makes a run of some rows and of less than a gigabyte [rad], [Hz], [rad/s]."""
+"""Ranges that make a run of some rows and of less than a gigabyte [rad], [Hz], [rad/s]."""
 _LADDER = (1.0, 0.6, 0.28)  # of the largest bend: triangles of decreasing amplitude
 
 

@@ -1,4 +1,4 @@
-"""How kernels are compiled: one set of flags, and a cache that never goes stale.
+"""Compilation of kernels: one set of flags, and a cache that never goes stale.
 
 numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale
 results. The cache directory is therefore named after a hash of every kernel source, of the arrays' names and
@@ -82,7 +82,7 @@ def _cache_dir() -> str | None:
 
 
 CACHE_DIR = _cache_dir()
-"""Where compiled kernels are kept, or None."""
+"""Folder of compiled kernels, or None."""
 announce(cached=CACHE_DIR is not None)
 _let_threads_sleep()
 
@@ -103,7 +103,7 @@ def entry(function: _Function) -> _Function:
 
 
 def parallel_entry(function: _Function) -> _Function:
-    """As `entry`, with `prange` spread over threads."""
+    """See `entry`, with `prange` spread over threads."""
     return _compile(function, parallel=True)
 
 
@@ -133,7 +133,7 @@ class _Linked(JITCodeLibrary):
         return self
 
     def set_env(self, env_name: str, env: Any) -> None:
-        """Of what is never called by itself there is none."""
+        """Ignore the environment: a function that is never called by itself has none."""
 
     def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
         """None; optimised it is from here on."""
@@ -145,8 +145,8 @@ class _Linked(JITCodeLibrary):
 
 
 class _Inner(CPUDispatcher):
-    """What kernels call. Numba's wrappers for Python and C took half the time of the compiler, so it has
-    none; the first call from Python compiles the function once more, with them."""
+    """Function that kernels call. Numba's wrappers for Python and C took half the time of the compiler, so
+    it has none; the first call from Python compiles the function once more, with them."""
 
     wrapped: Callable[..., Any] | None = None
 
@@ -211,7 +211,8 @@ _POINTED: list[Any] = []
 
 
 def _own_folder(function: Callable[..., Any]) -> str | None:
-    """Where the code of this function is kept: a folder for each state of the file that it stands in."""
+    """Return where the code of this function is kept: a folder for each state of the file that it stands
+    in."""
     file = getattr(sys.modules.get(function.__module__), "__file__", None)
     if CACHE_DIR is None or file is None:  # of a notebook
         return None

@@ -1,4 +1,4 @@
-"""What happens around the compilation of a kernel: a line on stderr, for a first run that prints nothing for
+"""Notices around the compilation of a kernel: a line on stderr, for a first run that prints nothing for
 half a minute looks hung, and no garbage collection, which finds nothing and takes a tenth of the time."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SECONDS = {
     "pass_modes": ("modes", 50),
     "derive_modes": ("derivatives of modes", 15),
 }
-"""What the large kernels compute, and how long each group takes to compile on one core of 2025 [s]
+"""Purpose of the large kernels, and the time that each group takes to compile on one core of 2025 [s]
 (`fastrod warmup`)."""
 
 

@@ -18,7 +18,7 @@ from .jit import entry
 Floats = NDArray[np.float64]
 
 SLIDERS = 5
-"""Of `elastoplastic`."""
+"""Number of sliders of `elastoplastic`."""
 BUFFER = 128
 """Past steps that `delay` keeps; a delay longer than they span is cut to it."""
 

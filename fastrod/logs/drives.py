@@ -1,4 +1,4 @@
-"""What drives did of what they were commanded: logs that hold measured positions of the drives (`pos_k`)
+"""Positions of the drives beside their commands: logs that hold measured positions of the drives (`pos_k`)
 beside the commands (`dl_k`)."""
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def moved(log: RunLog) -> RunLog:
 
 
 def sentences(log: RunLog) -> list[str]:
-    """What the drives of each run did of their commands, where it is less or more than these."""
+    """Return what the drives of each run did of their commands, where it is less or more than these."""
     said = []
     for label, rows in _runs(log):
         lag, dl = _lag(log, rows), log.dl[rows]

@@ -1,1 +1,1 @@
-"""What a robot is: segments, tendons and their routing, its file, and both as arrays for the kernels."""
+"""A robot: segments, tendons and their routing, its file, and both as arrays for the kernels."""

@@ -15,7 +15,7 @@ _INEXTENSIBLE = 1e-9  # m/N; below it the tensions of three tendons that lock th
 
 
 class DefaultInputs(NamedTuple):
-    """What the ports hold when nobody asks for anything else; robot axis 1 or n_robots."""
+    """Default values of the ports; robot axis 1 or n_robots."""
 
     stiffness: Floats
     """(n_robots, n_segments, 1, 3) diag K [N m^2]."""

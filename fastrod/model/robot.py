@@ -337,12 +337,13 @@ class Robot:
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
     log_offsets: tuple[tuple[float, float], ...] = ()
-    """Where these lie beside the backbone, along d1 and d2 of the cross-section there [m]; left out: on
-    it."""
+    """Offsets of these markers from the backbone, along d1 and d2 of the cross-section there [m]; left
+    out: on it."""
     log: LogFormat = field(default_factory=LogFormat)
     """Columns, units and signs of this robot's own log files (contracts: `[log]`)."""
     effects: tuple[Mapping[str, Any], ...] = ()
-    """What a robot file adds to the rod (contracts: `[[effect]]`): a name, and the effect's parameters."""
+    """Effects that a robot file adds to the rod (contracts: `[[effect]]`): a name, and the effect's
+    parameters."""
     fit: Mapping[str, Mapping[str, float | bool]] = field(default_factory=dict)
     """Parameters that are not known exactly, each with its prior (contracts: `[fit]`)."""
     sensor: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)

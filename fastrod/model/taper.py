@@ -108,8 +108,8 @@ def _pieces(table: Mapping[str, Any], n: int) -> Iterator[dict[str, Any]]:
 
 
 def _edges(radius: Any, n: int) -> list[float]:
-    """Where the pieces of a segment begin and end, of its length: of a cone each is as many times as thin as
-    the one before, so that none is much softer at its end than at its base."""
+    """Return where the pieces of a segment begin and end, of its length: of a cone each is as many times
+    as thin as the one before, so that none is much softer at its end than at its base."""
     if not isinstance(radius, list) or math.isclose(*radius):
         return [i / n for i in range(n + 1)]
     ratio = radius[1] / radius[0]
@@ -143,8 +143,8 @@ def _along(tendon: Any, counts: Sequence[int], radii: Sequence[Any], where: str)
 
 
 def _middle(radius: Any, first: float, last: float) -> float:
-    """Where between two places of a segment a tendon on a cone has the offset that bends it as far as the
-    piece bends: the mean of its place weighed with the softness radius^-4, by Simpson's rule."""
+    """Return where between two places of a segment a tendon on a cone has the offset that bends it as far
+    as the piece bends: the mean of its place weighed with the softness radius^-4, by Simpson's rule."""
     middle = 0.5 * (first + last)
     if not isinstance(radius, list):
         return middle

@@ -1,4 +1,4 @@
-"""What a simulator of modes did, call by call, and every balance that it solved as a linear map."""
+"""Record of a simulator of modes, call by call, and of every balance that it solved as a linear map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Acting(NamedTuple):
 
     @classmethod
     def of(cls, modal: ModalSolver, given: Inputs, ports: Ports, points: tuple[Floats, Floats]) -> Acting:
-        """What acts now: copies."""
+        """Return what acts now: copies."""
         return cls(
             given,
             ports._replace(**{k: np.array(a, order="C") for k, a in ports._asdict().items()}),
@@ -54,7 +54,7 @@ class Event(NamedTuple):
     """Its scheme is REST where they were brought to rest."""
     acting: Acting
     before: ModalMotion
-    """Of all robots, before it."""
+    """Snapshot of all robots, before it."""
     q: Floats
     """(n_robots, n_q) after it."""
 
@@ -69,7 +69,7 @@ class Balance(NamedTuple):
     jump: Floats
     """(n_robots,)"""
     motion: ModalMotion
-    """Of all robots, from which it counts."""
+    """Motion of all robots from which it counts."""
     q: Floats
     """(n_robots, n_q) its solution."""
     hessian: Floats

@@ -88,7 +88,7 @@ class BoundarySolver:
 
     @property
     def memory(self) -> Memory:
-        """What the observer carries on, to read and to write."""
+        """Return what the observer carries on, to read and to write."""
         return self._memory if self._resident is None else self._resident.write()
 
     @memory.setter

@@ -19,7 +19,7 @@ class RodSolver:
     boundary: BoundarySolver
     warm: Flags
     tolerance: float | None
-    """Of `settle` [m]; None in a step."""
+    """Tolerance of `settle` [m]; None in a step."""
     recovery: Boundary | None
     process: float
     noise: float

@@ -1,5 +1,5 @@
-"""Where a cold start begins: arcs from the tendon lengths, and on them the moments and tensions that statics
-asks for.
+"""Start of a cold solve: arcs from the tendon lengths, and on them the moments and tensions that statics asks
+for.
 
 From here Newton's method takes four to six passes; from zero it diverges.
 """

@@ -1,4 +1,4 @@
-"""What a caller gives, checked and broadcast into `Ports`: shapes are refused at once, bad values row by
+"""Inputs of a caller, checked and broadcast into `Ports`: shapes are refused at once, bad values row by
 row."""
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def mobility(obstacle: str, translation: float, rotation: ArrayLike, center: Arr
 
 
 class Inputs(NamedTuple):
-    """What a caller may give at one step; shapes, units and frames as in `Simulator.step`."""
+    """Inputs that a caller may give at one step; shapes, units and frames as in `Simulator.step`."""
 
     tendon_length: ArrayLike | None = None
     tension: ArrayLike | None = None
@@ -289,7 +289,7 @@ class Reader:
         return np.array(np.broadcast_to(line, shape), order="C")  # a view would be read-only: another type
 
     def _line(self, name: str, value: ArrayLike, grid: Floats) -> Floats:
-        """As `Ports` has it: (n, 1, 1, 3) of one force, (n, n_segments, 2 n_steps, 3) of samples."""
+        """See `Ports` has it: (n, 1, 1, 3) of one force, (n, n_segments, 2 n_steps, 3) of samples."""
         n_segments, n_steps = len(self.layout.first_tendon), self.layout.n_steps
         try:
             axes = np.ndim(value)

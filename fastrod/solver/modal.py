@@ -55,18 +55,18 @@ if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's t
 
 
 class Modes(NamedTuple):
-    """How finely the rod is resolved: modes of a piece, and pieces of a segment."""
+    """Resolution of the rod: modes of a piece, and pieces of a segment."""
 
     bending: int = 5
-    """Of the curvature about d1, and about d2."""
+    """Number of modes of the curvature about d1, and about d2."""
     torsion: int = 3
     strain: int = 2
-    """Of the stretch, and of each shear, where a segment has a stiffness for it."""
+    """Number of modes of the stretch, and of each shear, where a segment has a stiffness for it."""
     pieces: int = 1
 
 
 class Step(NamedTuple):
-    """How a step in time is taken."""
+    """One step in time."""
 
     scheme: int
     dt: float
@@ -185,8 +185,8 @@ def no_points(n_robots: int) -> ModalPoints:
 
 
 _LEAK = 1e-9
-"""Of the largest mobility: what a body gives way along where its joints hold it, so that its inertia is a
-number."""
+"""Fraction of the largest mobility: what a body gives way along where its joints hold it, so that its
+inertia is a number."""
 
 
 def no_hosts() -> ModalHost:

@@ -18,8 +18,8 @@ from fastrod.types import Flags, Floats, Ints, Ports
 _ENOUGH = 20  # Newton steps on a balance that is nearly solved
 _LAST = 1e-10  # of the largest unknown: a Newton step below it leaves an error of its square
 _STEP = 1e-4
-"""Of a length or a force, at fixed unknowns: the error of a central difference is of its square, and of
-rounding over it, some 1e-9 both."""
+"""Relative step of a length or a force, at fixed unknowns: the error of a central difference is of its
+square, and of rounding over it, some 1e-9 both."""
 
 
 @dataclass(frozen=True)

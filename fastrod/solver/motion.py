@@ -30,7 +30,7 @@ _TOLERANCE = 1e-9  # m: of the rest from which a motion starts
 
 
 class Moving(NamedTuple):
-    """What rods of modes remember."""
+    """Memory of rods of modes."""
 
     motion: ModalMotion
     change: dict[str, Floats]
@@ -221,7 +221,7 @@ class Motions(Statics):
             self._modal.replace((robot,))
 
     def _prepare(self, modal: ModalSolver, ports: Ports) -> None:
-        """What a pass reads beside the ports."""
+        """Prepare what a pass reads beside the ports."""
         modal.params = self._passes.params
         gravity = modal.gravity if self._reader.gravity is None else self._reader.gravity
         modal.pieces = modal.pieces._replace(gravity=gravity)

@@ -16,7 +16,7 @@ Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
 LOST = 0.1
-"""Of the robot's length: a residual beyond it is no shape of this robot."""
+"""Fraction of the robot's length: a residual beyond it is no shape of this robot."""
 _MAX_ITERATIONS = 40
 _FREE_ITERATIONS = (
     20  # robots with tendons that can go slack: semi-smooth Newton first, monotone only after that
@@ -201,8 +201,8 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
 def _continuation(
     rows: Ints, boundary: BoundarySolver, ports: Ports, tolerance: float, run: Pass, passes: Ints
 ) -> Ints:
-    """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did
-    not arrive."""
+    """Continue from the unloaded robot to the loaded one, in load steps that grow with success; the robots
+    that did not arrive."""
     layout, params = boundary.layout, boundary.params
     fraction = np.zeros(boundary.n_robots)
     longest = np.full(boundary.n_robots, 0.25)

@@ -1,4 +1,4 @@
-"""What a `Simulator` takes besides inputs, and what it hands out."""
+"""Inputs and outputs of a `Simulator`."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class State:
     problems: Mapping[int, str]
     """Robot index -> what is wrong with it, for the robots that are not ok: a sentence (`problem_kinds`)."""
     contacts: Contacts | None = None
-    """What touches what; None without a contact scene."""
+    """Contacts of the rods and the obstacles; None without a contact scene."""
     velocity: Floats | None = None
     """(n_robots, n_points, 3) world [m/s]; None but for rods of modes, as the three that follow."""
     strain: Floats | None = None
@@ -175,7 +175,7 @@ class Snapshot(NamedTuple):
     """(n_robots,) as effects count it [s]; nan before the first step."""
     contact: ContactSnapshot | None
     moving: Any = None
-    """What rods of modes remember."""
+    """Memory of rods of modes."""
 
 
 def check_snapshot(

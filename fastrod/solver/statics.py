@@ -366,7 +366,7 @@ class Statics:
         return ports, rows
 
     def _step_compliance(self) -> Floats | None:
-        """How the tip gives to a force within a step."""
+        """Return how the tip gives to a force within a step."""
         return self._tip_compliance()
 
     def _tip_compliance(self) -> Floats | None:

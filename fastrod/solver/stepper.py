@@ -38,7 +38,7 @@ _FRACTIONS = np.linspace(0.125, 1.0, 8)  # of the load, where a robot does not c
 
 
 class PassShapes(NamedTuple):
-    """What a pass writes."""
+    """Shapes that a pass writes."""
 
     shape: RodShape
     motion: MotionShape

@@ -80,7 +80,7 @@ class Tape:
         self._velocity.append(motion.velocity[:, self._tip].copy())
 
     def tips(self) -> Tips:
-        """What the simulator found. Raises `InputError` before the first call."""
+        """Return what the simulator found. Raises `InputError` before the first call."""
         self._check()
         return _as_tips(np.stack(self._place), np.stack(self._velocity))
 
@@ -202,7 +202,7 @@ class Input:
         return np.broadcast_to(array, shape)
 
     def change(self, modal: ModalSolver, event: Event, balance: Balance, step: Floats) -> Change:
-        """Of g and of what has inertia by this step (n_robots, size) of the input."""
+        """Change of the balance g and of the inertial states per change of this input, (n_robots, size)."""
         port = self.ports[self.name]
         now = getattr(event.acting.ports, port)
         if not len(now):
@@ -244,7 +244,7 @@ class Twin:
             self._sides.append((reader, solver))
 
     def change(self, event: Event, balance: Balance) -> Change:
-        """Of g and of what has inertia by the number."""
+        """Change of the balance g and of the inertial states per change of the number."""
         found = []
         for reader, modal in self._sides:
             ports = reader.ports(event.acting.given)
@@ -311,6 +311,6 @@ def _worked(change: Change, work: Floats, moved: Floats) -> Floats:
 
 
 def _as_tips(place: Floats, velocity: Floats) -> Tips:
-    """Of the numbers of the last node (n_calls, n_robots, 12, ...)."""
+    """Return the numbers of the last node (n_calls, n_robots, 12, ...) as tips."""
     directors = place[:, :, 3:].reshape(*place.shape[:2], 3, 3, *place.shape[3:])
     return Tips(place[:, :, :3], np.swapaxes(directors, 2, 3), velocity[:, :, :3])

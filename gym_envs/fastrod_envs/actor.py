@@ -31,7 +31,7 @@ class Actor(NamedTuple):
     half_range: Singles
     """(n_obs,) from there to a bound."""
     activation: Activation
-    """Of the hidden layers."""
+    """Activation function of the hidden layers."""
     squashed: bool
     """The last layer ends in a tanh (SAC, TD3); otherwise it is clipped."""
 
@@ -99,7 +99,7 @@ def load_actor(path: Path) -> Actor:
 def _misfit(
     weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, half_range: np.ndarray
 ) -> str:
-    """What hinders the layers to be one network of finite numbers, or nothing."""
+    """Return what hinders the layers to be one network of finite numbers, or nothing."""
     arrays = (middle, half_range, *weights, *biases)
     if not weights or any(a.dtype != np.float32 for a in arrays):
         return "its layers are not numbers of single precision"

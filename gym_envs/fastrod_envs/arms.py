@@ -1,4 +1,4 @@
-"""What the tasks with arms share: a soft robot whose base is commanded where to be; how arms are drawn."""
+"""Base of the tasks with arms: a soft robot whose base is commanded where to be; how arms are drawn."""
 
 from __future__ import annotations
 

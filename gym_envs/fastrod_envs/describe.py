@@ -1,5 +1,5 @@
-"""What a task is, for people: its documentation, and every number of its observations and actions with its
-unit."""
+"""Description of a task for people: its documentation, and every number of its observations and actions
+with its unit."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def describe(name: str, options: Mapping[str, Any] | None = None, *, timed: bool
 
 
 def _speed(name: str, hosted: bool, options: Mapping[str, Any]) -> str:
-    """How fast the task steps on this machine, alone and side by side."""
+    """Return how fast the task steps on this machine, alone and side by side."""
     from fastrod_envs.vector import BatchEnv
 
     said = []

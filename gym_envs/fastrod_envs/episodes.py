@@ -18,7 +18,7 @@ _EPISODES = 64  # drawn at once: one call of a generator costs as much as many n
 
 
 class Moment(NamedTuple):
-    """What a step brings, robot axis first."""
+    """Arrays of one step, robot axis first."""
 
     outcome: Outcome
     reward: Floats

@@ -48,7 +48,7 @@ class Trial(NamedTuple):
     steps: Floats
     """(n,)"""
     facts: dict[str, Floats]
-    """What else the task tells, (n, ...)."""
+    """Further facts of the task, (n, ...)."""
 
 
 @dataclass(frozen=True)

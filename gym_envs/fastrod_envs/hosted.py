@@ -19,7 +19,7 @@ from fastrod_envs.task import Backdrop, Field, Outcome, Task
 
 
 class HostedResult(NamedTuple):
-    """How a step of one environment went; as `Outcome`, without the robot axis."""
+    """Result of a step of one environment; as `Outcome`, without the robot axis."""
 
     terms: dict[str, float]
     distance: float
@@ -48,7 +48,7 @@ class Cell(ABC):
 
     @abstractmethod
     def result(self) -> HostedResult:
-        """How the last step went."""
+        """Return how the last step went."""
 
     @abstractmethod
     def state(self) -> Floats:
@@ -64,7 +64,7 @@ class Cell(ABC):
 
     @abstractmethod
     def backdrop(self) -> Backdrop:
-        """What it looks like, for the page."""
+        """Return what it looks like, for the page."""
 
     def picture(self, width: int, height: int) -> np.ndarray:
         """(height, width, 3) uint8: the backdrop, unless a cell has a world with more to see."""
@@ -80,7 +80,7 @@ class HostedTask(Task):
 
     hosted: ClassVar[bool] = True
     duration: ClassVar[float]
-    """Of an episode [s]."""
+    """Duration of an episode [s]."""
 
     def __init__(
         self,
@@ -111,8 +111,8 @@ class HostedTask(Task):
         """A new environment."""
 
     def begin(self, rows: Ints, draws: Floats) -> None:
-        """As `Task.begin`, cell by cell. A cell that raises `HostError` is closed and made anew; if it raises
-        again, so does this."""
+        """See `Task.begin`, cell by cell. A cell that raises `HostError` is closed and made anew; if it
+        raises again, so does this."""
         for i, row in zip(rows, draws, strict=True):
             robot = None
             if self._random is not None and self._random.n_draws:
@@ -128,8 +128,8 @@ class HostedTask(Task):
             self._sane[i] = self.cells[i].result()
 
     def act(self, action: Floats) -> None:
-        """As `Task.act`. A cell that raises `HostError`, or whose state is not finite, is lost until its next
-        episode, and shows its last good step."""
+        """See `Task.act`. A cell that raises `HostError`, or whose state is not finite, is lost until its
+        next episode, and shows its last good step."""
         for i, cell in enumerate(self.cells):
             try:
                 cell.act(action[i], self.dt)
@@ -141,7 +141,7 @@ class HostedTask(Task):
                 self._lost[i] = True
 
     def outcome(self) -> Outcome:
-        """Of each cell's last good step; one that is lost has not succeeded."""
+        """Outcomes of the cells' last good steps; one that is lost has not succeeded."""
         results = [result for result in self._sane if result is not None]
 
         def each(values: list[Any]) -> Any:
@@ -172,7 +172,7 @@ class HostedTask(Task):
         return np.asarray(np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0))
 
     def backdrop(self, i: int) -> Backdrop:
-        """As cell i gives it."""
+        """Return the backdrop that cell i gives."""
         return self.cells[i].backdrop()
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:

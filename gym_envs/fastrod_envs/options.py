@@ -1,4 +1,4 @@
-"""What every task can be given: length of an episode, what is observed, what an action is, what differs from
+"""Options of every task: length of an episode, what is observed, what an action is, what differs from
 robot to robot."""
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ class EnvOptions:
     action: Action = "rate"
     """`rate`: how fast tendons are displaced; `displacement`: where they go, at once (the paper's)."""
     randomise: Randomisation | Robot | str | Path | Mapping[str, Any] | None = None
-    """What differs from episode to episode in the robot's parameters and effects (`Randomisation`): a robot
-    file, such as an identified.toml, or a mapping of names to ranges."""
+    """Robot parameters and effects that differ from episode to episode (`Randomisation`): a robot file,
+    such as an identified.toml, or a mapping of names to ranges."""
     difficulty: float = 1.0
-    """From 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between episodes
-    (curriculum)."""
+    """Difficulty from 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between
+    episodes (curriculum)."""
     threads: int | None = None
-    """Of the simulator; None is numba's number."""
+    """Threads of the simulator; None is numba's number."""
     device: Device = "cpu"
-    """Of the simulator, `cpu` or `cuda`; tasks in which rods feel contact or hold a host's bodies have the
-    CPU alone."""
+    """Device of the simulator, `cpu` or `cuda`; tasks in which rods feel contact or hold a host's bodies
+    have the CPU alone."""
 
     def __post_init__(self) -> None:
         if self.n_steps is not None and (
@@ -76,7 +76,7 @@ def checked_difficulty(level: float) -> float:
 
 
 def checked_mapping(given: object) -> dict[str, Any]:
-    """What `reset` is given, as a new dictionary, or `InputError`."""
+    """Return what `reset` is given, as a new dictionary, or `InputError`."""
     if given is not None and not isinstance(given, Mapping):
         raise InputError(f"options are {given!r}; give a dictionary, or None.")
     return dict(given or {})

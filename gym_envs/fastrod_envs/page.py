@@ -133,7 +133,7 @@ class EnvPage:
         self._drawn[name] = handle, np.array(pairs)
 
     def _known(self, name: str, points: Floats) -> Any:
-        """What is drawn under this name, if it has as many points."""
+        """Return what is drawn under this name, if it has as many points."""
         handle, before = self._drawn.get(name, (None, np.zeros(0)))
         return handle if before.shape == np.shape(points) else None
 

@@ -1,4 +1,4 @@
-"""What a `Backdrop` is drawn of (`pieces`), and a small painter: what it looks like, in some milliseconds,
+"""The pieces of a `Backdrop` (`pieces`), and a small painter: what it looks like, in some milliseconds,
 without a window or a graphics card.
 
 Everything becomes triangles. Of one layer the nearest triangle at every pixel is found, at twice the
@@ -72,7 +72,7 @@ class Layer(NamedTuple):
 
 
 class PainterCamera(NamedTuple):
-    """Where the eye is, and what of the world a pixel is."""
+    """Position of the eye, and the size of a pixel in the world."""
 
     eye: Floats
     """(3,) world [m]."""
@@ -242,7 +242,7 @@ def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
 
 
 def _plate(points: Floats, radius: float) -> PaintedMesh:
-    """What a rod along these points stands on."""
+    """Return what a rod along these points stands on."""
     along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
     ends, n = np.array([points[0] - 0.7 * radius * along, points[0]]), 2 * _SIDES
     rim = tube_mesh(ends, 2.2 * radius, n).vertices[: 2 * n].reshape(2, n, 3)

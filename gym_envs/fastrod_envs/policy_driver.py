@@ -41,7 +41,7 @@ class PolicyDriver:
     """
 
     dt = DT
-    """Of a step [s]."""
+    """Time of a step [s]."""
 
     def __init__(
         self,

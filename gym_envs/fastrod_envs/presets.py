@@ -1,5 +1,4 @@
-"""How each task is trained unless the command says otherwise: algorithm, batch, steps, and the options of its
-environments."""
+"""Training presets of each task: algorithm, batch, steps, and the options of its environments."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from fastrod_envs.registration import name_of
 
 ALGORITHMS = ("sac", "ppo", "td3")
 NETWORK = (256, 256)
-"""Of the paper, as learning rate and discount."""
+"""Network of the paper, with its learning rate and discount."""
 LEARNING_RATE, DISCOUNT = 3e-4, 0.99
 
 
@@ -28,9 +27,9 @@ class Preset:
     imitate: int = 0
     """Steps of the scripted baseline's lessons before (dataset aggregation, Ross 2011)."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the environments."""
+    """Options of the environments."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of the algorithm."""
+    """Settings of the algorithm."""
 
 
 _ROBOTS: Mapping[str, Any] = {
@@ -161,7 +160,7 @@ _SETTINGS: Mapping[str, Mapping[str, _Range]] = {
 """Settings of each algorithm of stable-baselines3 that a command line can give: kind, least and largest
 value; 0 is no learning rate."""
 _WORDS: Mapping[str, str] = {"ent_coef": "auto", "target_entropy": "auto"}
-"""Of SAC: a word that is as good as a number."""
+"""Settings of SAC by name: a word that is as good as a number."""
 _NONE = ("clip_range_vf", "target_kl")
 _POLICY: Mapping[str, _Range] = {"log_std_init": (float, -20.0, 20.0), "n_critics": (int, 1, 100)}
 """Numbers of policy_kwargs."""
@@ -175,7 +174,7 @@ _SYNONYMS: Mapping[str, str] = {
     "lambda": "gae_lambda",
     "entropy": "ent_coef",
 }
-"""What other libraries call them."""
+"""Names that other libraries use."""
 
 
 def check_settings(algorithm: str, given: Mapping[str, Any]) -> None:

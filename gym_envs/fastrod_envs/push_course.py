@@ -1,4 +1,4 @@
-"""Where a cube is pushed, and three numbers that drive the robot: for Push and QuadrupedPush."""
+"""Geometry of pushing a cube, and three numbers that drive the robot: for Push and QuadrupedPush."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from fastrod_envs.options import EnvOptions
 
 @dataclass(frozen=True, kw_only=True)
 class PushOptions(EnvOptions):
-    """Of Push and QuadrupedPush."""
+    """Options of Push and QuadrupedPush."""
 
     feels: bool = True
-    """What the cube exerts on the bar bends the robot in its next step; False: the bar moves as if nothing
-    were there."""
+    """Whether the force of the cube on the bar bends the robot in its next step; False: the bar moves as
+    if nothing were there."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -31,7 +31,7 @@ class PushOptions(EnvOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """Where a robot pushes which cube, and where to."""
+    """Course of a push: robot, cube and goal."""
 
     robot: Robot
     """Carries the bar at its tip, along its d2."""
@@ -44,13 +44,13 @@ class Course:
     steepness: float
     """k of the reward exp(-k d^2) [1/m^2]."""
     width: float = 0.08
-    """Of the bar, without its round ends [m]."""
+    """Width of the bar, without its round ends [m]."""
     thickness: float = 0.022
     """Radius of the bar, more than the robot's: the cube meets the bar [m]."""
     size: float = 0.08
     """Edge of the cube [m]."""
     mass: float = 0.05
-    """Of the cube [kg]."""
+    """Mass of the cube [kg]."""
     gap: float = 0.02
     """Between bar and cube at first [m]."""
     bend: float = 0.6
@@ -64,7 +64,7 @@ class Course:
 
     @property
     def behind(self) -> float:
-        """From the cube's middle to a tip whose bar touches it straight behind [m]."""
+        """Return the distance from the cube's middle to a tip whose bar touches it straight behind [m]."""
         return 0.5 * self.size + self.thickness
 
 
@@ -90,7 +90,7 @@ class Drive:
         """(3,) the largest rate [m/s]: half a radian a second in each segment."""
 
     def inputs(self, q: Floats) -> Any:
-        """Of the simulator for these numbers (3,)."""
+        """Inputs of the simulator for these numbers (3,)."""
         return self.actions.inputs(self.spread @ q)
 
     def jacobian(self, simulator: Simulator) -> Floats:

@@ -25,9 +25,9 @@ from fastrod_envs.push_course import Course, Drive, PushOptions
 from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 
 ACCURACY = 0.02
-"""Of the cube's place [m]."""
+"""Accuracy of the cube's place [m]."""
 SPEED = 0.15
-"""Of the baseline's tip, the largest [m/s]."""
+"""Speed of the baseline's tip, the largest [m/s]."""
 TIME = 0.2
 """In which it covers what is left [s]."""
 _STEP = 0.1  # s, the longest of the rod
@@ -319,7 +319,7 @@ class PushCell(Cell):
 
 
 class PushTask(HostedTask):
-    """What Push and QuadrupedPush share: three numbers move the tip, the cube goes where it is pushed."""
+    """Base of Push and QuadrupedPush: three numbers move the tip, the cube goes where it is pushed."""
 
     options_class: ClassVar[type[EnvOptions]] = PushOptions
     n_steps: ClassVar[int] = 40
@@ -327,7 +327,7 @@ class PushTask(HostedTask):
     accuracy: float = ACCURACY
     duration: ClassVar[float] = 4.0
     picture_world: Callable[[], Bullet] | None = None
-    """As in `PushCell`."""
+    """See `PushCell`."""
 
     def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:
         self.course = course
@@ -384,7 +384,7 @@ def _load(wrench: Floats) -> dict[str, Any]:
 
 
 def _bodies(world: Bullet, course: Course, robot: Robot) -> tuple[RodBodies, RodBodies]:
-    """Of the robot and its bar."""
+    """Return the bodies of the robot and its bar."""
     radii = [segment.body_radius or course.thickness for segment in robot.segments for _ in range(_CAPSULES)]
     tube = RodBodies(world, robot.length, radii, len(radii), color=(*_ROD, 1.0))
     return tube, RodBodies(world, course.width, course.thickness, 1, color=(*_BAR, 1.0))

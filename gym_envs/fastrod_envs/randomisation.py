@@ -26,7 +26,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """What is drawn, evenly from its range, at the start of every episode.
+    """Distributions drawn, evenly from their ranges, at the start of every episode.
 
     >>> stiffness, play = {"bending_stiffness": (0.8, 1.2)}, {"backlash.half_width": (0.0, 3e-4)}
     >>> Randomisation(parameters=stiffness, effects=play).n_draws
@@ -74,9 +74,9 @@ class Randomisation:
 
     @classmethod
     def of(cls, given: object) -> Randomisation | None:
-        """From what an option may hold: None, a robot or its file (its effects within 20 %), a mapping with
-        these fields, or ranges alone, in which a dot marks an effect. Raises `InputError`, and what
-        `load_robot` raises."""
+        """Make one from any value that an option may hold: None, a robot or its file (its effects within
+        20 %), a mapping with these fields, or ranges alone, in which a dot marks an effect. Raises
+        `InputError`, and what `load_robot` raises."""
         if given is None or isinstance(given, Randomisation):
             return given
         if isinstance(given, Robot):

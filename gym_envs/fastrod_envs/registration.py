@@ -33,7 +33,7 @@ class TaskEntry:
     """`module:Class` of a shipped task, which imports numba and is imported when one is made; or the
     class."""
     n_steps: int
-    """Of an episode, for Gymnasium."""
+    """Number of steps of an episode, for Gymnasium."""
     solved: float | None = None
     """Mean return from which the task counts as solved, for Gymnasium; None: nobody has said."""
 

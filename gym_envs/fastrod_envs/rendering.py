@@ -13,7 +13,7 @@ from fastrod_envs.task import Task
 
 MODES = ("rgb_array", "viser")
 WIDTH, HEIGHT = 480, 360
-"""Of a picture."""
+"""Size of a picture [pixels]."""
 
 
 @final

@@ -110,7 +110,7 @@ class RodTask(Task):
         self._home_tip, self._home_direction = self.tip[0].copy(), self.direction[0].copy()
 
     def loads(self) -> dict[str, Any]:
-        """What the simulator is given besides tendons: loads, obstacles."""
+        """Return what the simulator is given besides tendons: loads, obstacles."""
         return {}
 
     def start(self, rows: Ints, draws: Floats) -> None:
@@ -143,7 +143,7 @@ class RodTask(Task):
         self.moved()
 
     def moved(self) -> None:
-        """What else happens in a step, once the robots have moved: nothing."""
+        """Hook after the robots have moved in a step: nothing."""
 
     def posture(self) -> Floats:
         """(n_envs, n_driven) displacements from -1, the least, to 1, the largest."""

@@ -45,8 +45,8 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """As `BatchEnv`, with one environment. One that `gymnasium.make` makes without n_steps leaves the end
-        of an episode to it."""
+        """See `BatchEnv`, with one environment. One that `gymnasium.make` makes without n_steps leaves the
+        end of an episode to it."""
         self._spec: EnvSpec | None = None
         self._own_steps = max_episode_steps is not None or options.get("n_steps") is not None
         self.render_mode = render_mode
@@ -60,7 +60,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What `gymnasium.make` made it from; None where nobody did."""
+        """Return what `gymnasium.make` made it from; None where nobody did."""
         return self._spec
 
     @spec.setter

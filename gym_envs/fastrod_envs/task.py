@@ -72,21 +72,21 @@ class Tube(NamedTuple):
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What one environment looks like now, world frame."""
+    """One environment as it looks now, world frame."""
 
     tubes: tuple[Tube, ...] = ()
     balls: tuple[Ball, ...] = ()
     solids: tuple[Solid, ...] = ()
     lines: tuple[DrawnLine, ...] = ()
     eye: tuple[float, float, float] = (0.9, 0.9, 0.6)
-    """From where it is looked at [m]."""
+    """Position of the eye [m]."""
     target: tuple[float, float, float] = (0.0, 0.0, 0.25)
-    """What is in the middle of the picture [m]."""
+    """Middle of the picture [m]."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a step went, robot axis first."""
+    """Outcome of a step, robot axis first."""
 
     terms: dict[str, Floats]
     """The terms of the reward, each (n,); their sum is the reward."""
@@ -105,7 +105,7 @@ class Outcome:
     lost: Flags
     """(n,) the simulation did not find this robot's shape; the episode ends, and counts as failed."""
     facts: dict[str, Floats] = field(default_factory=dict)
-    """What else a user may want to know, each (n, ...); goes into info."""
+    """Further facts for a user, each (n, ...); goes into info."""
 
 
 class Task(ABC):
@@ -116,9 +116,9 @@ class Task(ABC):
     """
 
     name: ClassVar[str]
-    """Of the id fastrod/<name>-v0."""
+    """Name in the id fastrod/<name>-v0."""
     n_steps: ClassVar[int]
-    """Of an episode, unless the options say otherwise."""
+    """Number of steps of an episode, unless the options say otherwise."""
     n_draws: ClassVar[int]
     """Numbers from 0 to 1 that an episode draws for its goal and scene, randomisation apart."""
     accuracy: float
@@ -155,7 +155,8 @@ class Task(ABC):
         """Numbers that an episode draws, randomisation included."""
 
     def set_difficulty(self, level: float) -> None:
-        """From the next episode on: 0 is the easiest, 1 the whole task. Raises `InputError`."""
+        """Set the difficulty from the next episode on: 0 is the easiest, 1 the whole task. Raises
+        `InputError`."""
         self.difficulty = checked_difficulty(level)
 
     @abstractmethod
@@ -169,7 +170,7 @@ class Task(ABC):
 
     @abstractmethod
     def outcome(self) -> Outcome:
-        """How the last step went."""
+        """Return how the last step went."""
 
     @abstractmethod
     def state(self) -> Floats:
@@ -186,7 +187,7 @@ class Task(ABC):
 
     @abstractmethod
     def backdrop(self, i: int) -> Backdrop:
-        """What environment i looks like now."""
+        """Return what environment i looks like now."""
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:  # noqa: ARG002
         """(height, width, 3) uint8 of environment i where a host draws it; None leaves it to the drawing of

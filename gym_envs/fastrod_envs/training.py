@@ -37,7 +37,7 @@ _LARGEST = 1_000_000  # bytes of a config.json; those that ship have a thousand
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPlan:
-    """What is trained and how; `config.json` holds it."""
+    """Plan of a training; `config.json` holds it."""
 
     env: str
     """Id of the environment."""
@@ -49,7 +49,7 @@ class TrainingPlan:
     imitate: int
     """Steps of lessons by the scripted baseline before."""
     options: dict[str, Any]
-    """Of the environment."""
+    """Options of the environment."""
     settings: dict[str, Any]
     """Keyword arguments of the algorithm, as stable-baselines3 names them."""
     curriculum: float
@@ -78,7 +78,7 @@ class TrainingPlan:
 
 
 class _State(TypedDict):
-    """How far a training is."""
+    """Progress of a training."""
 
     steps_done: int
     seconds: float
@@ -183,7 +183,7 @@ def read_config(out: Path) -> tuple[TrainingPlan, dict[str, Any]]:
 
 
 def algorithm_class(name: str) -> Any:
-    """Of stable-baselines3. Raises `InputError`."""
+    """Return the algorithm's class of stable-baselines3. Raises `InputError`."""
     import stable_baselines3
 
     if name not in ALGORITHMS:

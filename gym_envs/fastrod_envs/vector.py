@@ -24,7 +24,8 @@ _AUTORESET = {"same_step": AutoresetMode.SAME_STEP, "next_step": AutoresetMode.N
 
 
 def action_space(task: Task) -> gymnasium.spaces.Box:
-    """Of one environment: from -1 to 1, whose meaning and units `Task.actions` has."""
+    """Return the action space of one environment: from -1 to 1, whose meaning and units `Task.actions`
+    has."""
     return gymnasium.spaces.Box(-1.0, 1.0, (task.n_actions,), np.float32)
 
 
@@ -90,7 +91,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
 
     @property
     def n_steps(self) -> int:
-        """Of an episode."""
+        """Number of steps of an episode."""
         return self._episodes.n_steps
 
     @property

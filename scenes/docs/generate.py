@@ -60,7 +60,7 @@ API = {
 }
 """Packages whose public names the reference lists, and what they are for."""
 LAWS = ("Effect", "Law", "Static", "Operator", "BodyOperator", "Parameter", "Seam", "Signal", "effect")
-"""What an effect of one's own is made of, in `fastrod.effects.base`."""
+"""Names of `fastrod.effects.base` of which an own effect is made."""
 SECTIONS = {
     "Segment": ("[[segment]]", "fastrod.model.robot"),
     "Tendon": ("tendons of a segment", "fastrod.model.robot"),
@@ -267,8 +267,8 @@ def _example(name: str) -> str:
 
 
 def signature(name: str) -> str:
-    """How an effect of typical size moves the tip while one bend swings to and fro, as SVG; empty where it
-    does nothing then."""
+    """Return how an effect of typical size moves the tip while one bend swings to and fro, as SVG; empty
+    where it does nothing then."""
     from fastrod import load_robot
     from fastrod.errors import FastrodError
     from fastrod.identification.log.unknowns import known_model

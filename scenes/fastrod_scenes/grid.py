@@ -18,7 +18,7 @@ SIDE = 8
 APART = 0.3
 """Distance of neighbours [m]."""
 PERIOD = 4.0
-"""Of the motion of each robot [s]."""
+"""Period of the motion of each robot [s]."""
 WAVELENGTH = 1.5
 """Between robots in step, along a row [m]."""
 LAG = 0.6

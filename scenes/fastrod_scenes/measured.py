@@ -36,14 +36,14 @@ ASL_BASE = (0.1034, 0.1082)
 """Base [m], mocap x and z, where a run begins in motion: the mean of the disk centres where perlin_0g begins,
 nominal."""
 _ASL_NEAR_REST = 4.0
-"""Of a motor [deg]: the pose of a run that begins so near to rest is that of rest."""
+"""Asymmetry near rest of a motor [deg]: the pose of a run that begins so near to rest is that of rest."""
 ASL_SPOOL_RADIUS = 0.03
 """Nominal [m]. Without loads the shape knows only its ratio to the pitch radius; here that ratio is 1."""
 ASL_PITCH_RADIUS = 0.03
 """Nominal [m]."""
 
 ASL_NOISE = 5e-6
-"""Of the tip at rest, per axis, published [m]."""
+"""Noise of the tip at rest, per axis, published [m]."""
 ASL_COMPLIANCE = 1e-3
 """Nominal [m/N]: the tendons are kept tight by springs."""
 ASL_PRETENSION = 5.0
@@ -54,7 +54,7 @@ ASL_AXIAL_STIFFNESS = (300.0, 400.0, 500.0)
 OPENCR_SERVOS = (4, 3, 9, 5, 2, 8, 6, 1, 7)
 """The servo of each tendon, published."""
 OPENCR_STIFFNESS = 0.0098
-"""Of a steel core of 1 mm at 200 GPa [N m^2]."""
+"""Stiffness of a steel core of 1 mm at 200 GPa [N m^2]."""
 OPENCR_COMPLIANCE = 4e-5
 """Nominal [m/N]."""
 OPENCR_PRETENSION = 4.0
@@ -69,7 +69,7 @@ ARMLAB_PITCH_RADIUS = 0.0045
 ARMLAB_COMPLIANCE = 1e-4
 """Nominal [m/N]: all three tendons pulled by 10 mm then draw 100 N each, on a body that cannot shorten."""
 ARMLAB_NOISE = 6e-5
-"""Of the tip, per axis, published as 0.03 to 0.06 mm [m]."""
+"""Noise of the tip, per axis, published as 0.03 to 0.06 mm [m]."""
 ARMLAB_CELL = 0.0025
 """Edge of the cells of the cube of shortenings that label the rows: regions to hold out [m]."""
 ARMLAB_DIRECTION = (205.0, 85.0, 325.0)

@@ -58,7 +58,7 @@ class Scene(ABC):
     dt: ClassVar[float]
     """Time step [s]."""
     duration: ClassVar[float]
-    """Of a run [s]."""
+    """Duration of a run [s]."""
 
     @abstractmethod
     def run(self) -> Iterator[tuple[float, State]]:
@@ -106,7 +106,7 @@ class SoftBody(NamedTuple):
 
     robot: Robot
     state: State
-    """Of this robot alone."""
+    """State of this robot alone."""
     capsules: tuple[int, ...]
     """Numbers of the bodies that stand for it in the world: a drawing of the rod leaves them out."""
 
@@ -122,7 +122,7 @@ class Stage(ABC):
     @property
     @final
     def state(self) -> State:
-        """Of the first soft robot, after a step."""
+        """State of the first soft robot, after a step."""
         return self.soft_bodies[0].state
 
     @abstractmethod

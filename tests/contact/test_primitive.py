@@ -37,7 +37,7 @@ def on_surface(size, angles) -> np.ndarray:
 
 
 def smallest_distance(size, p) -> float:
-    """From a grid of angles, its best places refined by a general minimiser."""
+    """Return the smallest distance from a grid of angles, its best places refined by a general minimiser."""
     grid = np.stack(np.meshgrid(np.linspace(0, np.pi, 61), np.linspace(0, 2 * np.pi, 121)), -1).reshape(-1, 2)
     order = np.argsort(((on_surface(size, grid) - p) ** 2).sum(-1))[:3]
     scale = max(size) ** 2
@@ -165,7 +165,7 @@ def record(**changed) -> Primitive:
 
 @pytest.fixture
 def emptied(monkeypatch):
-    """What a test registers is gone after it."""
+    """Remove what a test registers after it."""
     monkeypatch.setattr(primitive, "_REGISTRY", dict(primitive._REGISTRY))
 
 
@@ -281,8 +281,8 @@ def run(script: str, *arguments: str, folder: Path | None = None) -> str:
 
 @pytest.mark.study
 def test_a_stranger_brings_a_shape_in_a_package_of_its_own(tmp_path, capsys):
-    """As it lies once it is installed: one file, and its entry point. The kernels of contact are not compiled
-    for it, and an edit of it is not missed."""
+    """A package of its own, as it lies once it is installed: one file, and its entry point. The kernels of
+    contact are not compiled for it, and an edit of it is not missed."""
     (tmp_path / "platelab.py").write_text(PACKAGE)
     (tmp_path / "platelab-1.0.dist-info").mkdir()
     (tmp_path / "platelab-1.0.dist-info" / "METADATA").write_text(

@@ -283,8 +283,8 @@ def test_a_ray_meets_the_triangle_that_brute_force_finds(name):
 
 
 def exact_ray(obstacle, p, v):
-    """Where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane, an
-    ellipsoid and a box."""
+    """Return where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane,
+    an ellipsoid and a box."""
     if obstacle.shape == "plane":
         t = np.array([-p[2] / v[2]])
     elif obstacle.shape == "sphere":

@@ -1,4 +1,4 @@
-"""What comes of a file that is damaged, hostile or fine: it is read right, or refused in one sentence.
+"""Reading of a file that is damaged, hostile or fine: it is read right, or refused in one sentence.
 
 File number k is the same for the same seed (`fuzz_seeds.py` makes it); `python perf/fuzz_files.py` tries
 thousands.
@@ -20,21 +20,21 @@ import numpy as np
 from fuzz_seeds import KINDS, Originals, write_case, write_fine
 
 SECONDS, BYTES = 10.0, 2_000_000_000
-"""What one file may cost."""
+"""Largest cost of one file."""
 FINE = ("right", "refused")
 _HARM = ("traceback", "code run", "over time", "over memory", "died")
 WRONG = (*_HARM, "more than a line", "printed beside", "wrong exit code", "wrong values")
-"""What may come of a file, and what may not."""
+"""Forbidden outcomes of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of one file."""
+    """Outcome of one file."""
 
     index: int
     kind: str
     attack: str
-    """How it was spoilt."""
+    """Kind of attack."""
     verdict: str
     """One of `FINE` or `WRONG`."""
     said: str

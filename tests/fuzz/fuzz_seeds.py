@@ -20,7 +20,7 @@ import numpy as np
 
 _MESHES = ("stl", "stl text", "obj", "ply", "ply text", "off", "glb")
 KINDS = ("policy", "robot", "hardware", "log csv", "log parquet", *(f"mesh {name}" for name in _MESHES))
-"""What reads a file, and its format: file number k is of kind k modulo their number."""
+"""Readers, and their formats: file number k is of kind k modulo their number."""
 _SUFFIX = {"robot": "toml", "hardware": "toml"}
 Rng = np.random.Generator
 Spoil = Callable[[bytes, Rng], bytes]
@@ -28,7 +28,7 @@ Spoil = Callable[[bytes, Rng], bytes]
 _NUMBERS = "nan inf -inf 1e400 1e308 -1e308 1e-320 0 -0.0 -1 1e9 2147483648 -9223372036854775809"
 _OTHERS = 'true "" "x\\ny" [] {} [[1]] \'\' 0x1p3 1_0 7.5 null'
 _ODD = (*_NUMBERS.split(), "9" * 40, "9" * 5000, *_OTHERS.split())
-"""What may stand in place of a number."""
+"""Values that may stand in place of a number."""
 
 
 class Originals:
@@ -36,7 +36,7 @@ class Originals:
 
     @cached_property
     def log(self) -> tuple[bytes, bytes]:
-        """As CSV and as Parquet, of the prototype."""
+        """Return the prototype's log as CSV and as Parquet."""
         import pyarrow
         import pyarrow.parquet
 

@@ -1,4 +1,5 @@
-"""What the fuzz tests share: settings, odd values, mutations of tables and texts, what a sentence is."""
+"""Strategies that the fuzz tests share: settings, odd values, mutations of tables and texts, what a
+sentence is."""
 
 from __future__ import annotations
 

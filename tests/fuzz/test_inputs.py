@@ -61,7 +61,7 @@ def good(sim: Simulator, seed: int) -> dict[str, Any]:
 
 
 def well(state: State) -> None:
-    """Where a state is ok it is finite; where it is not, it says why in one line."""
+    """A state that is ok is finite; where it is not, it says why in one line."""
     for name in FIELDS.split():
         assert np.isfinite(getattr(state, name)[state.ok]).all(), name
     assert set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
@@ -78,7 +78,7 @@ def differing(one: State, other: State, rows: Any = slice(None)) -> list[str]:
 
 @st.composite
 def arrays(draw: st.DrawFn, core: tuple[int, ...]) -> Any:
-    """What stands where an array (N, *core) should."""
+    """Return what stands where an array (N, *core) should."""
     if draw(st.integers(0, 9)) == 0:
         return draw(odd_values)
     before = [core, (1, *core), (N, *core), (N + 1, *core), (), (0, *core)]

@@ -264,7 +264,7 @@ PARTIAL = "\n".join(["# Recorded on robot prototype.", HEADER, *ROWS, ""])
 @tried(100)
 @given(data=st.data())
 def test_a_torn_partial_file_is_recovered_or_kept(folder: Path, data: st.DataObject) -> None:
-    """What a killed session left, cut and broken: whole rows come back, or nothing is taken away."""
+    """A killed session left a cut and broken file: whole rows come back, or nothing is taken away."""
     at = data.draw(st.integers(0, len(PARTIAL)))
     raw = data.draw(st.just(PARTIAL[:at].encode()) | broken_texts(PARTIAL))
     target, partial = folder / "torn.csv", folder / "torn.csv.part"

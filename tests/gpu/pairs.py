@@ -17,7 +17,7 @@ OTHERS = {"rotation": 1.0, "curvature": 14.0, "moment": 0.03, "force": 0.5, "tip
 OTHERS |= {"tension": 5.0, "base_wrench": 0.03}
 """Sizes of the numbers of a state in these robots: 1/l, EI/l, EI/l^2, EI/(d l)."""
 PAPER_STEP = ("position", "arclength", "tip_position", "path_length", "residual", "rotation", "tip_rotation")
-"""Of a step in paper mode: four tendons on two unknowns have many gains, which single precision tells apart,
+"""Step in paper mode: four tendons on two unknowns have many gains, which single precision tells apart,
 and curvature and moment follow the gain to 1e-9 and some; once settled all agree."""
 SINGLE = {"covariance": 1e-5, "gain": 1e-5, "move": 1e-7, "defect": 1e-7}
 """Kept in single precision: their last bit turns on the last bit of a double."""
@@ -38,7 +38,8 @@ def pair(robot: Robot | Sequence[Robot], n: int | None = 3, **options: Any) -> l
 
 
 def inputs(robot: Robot, k: int, n: int = 3) -> dict[str, Any]:
-    """What the robots are given at step k: lengths or tensions, and from step 2 on a tip force that moves."""
+    """Return what the robots are given at step k: lengths or tensions, and from step 2 on a tip force that
+    moves."""
     angle = 0.2 * np.arange(1, n + 1)[:, None] * (1.0, -0.6) + 0.01 * k
     given: dict[str, Any] = {"tip_force": np.outer(np.linspace(0.5, 1.0, n), (0.01, 0.02, -0.01)) * max(k, 1)}
     modes = {segment.mode for segment in robot.segments}

@@ -1,4 +1,5 @@
-"""What lives on the device: no copy of the memory is stale, and a steady step moves what it must alone."""
+"""Residence of arrays on the device: no copy of the memory is stale, and a steady step moves what it must
+alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report says is held against the noise: bounds of one fit, outliers of what is left, short logs."""
+"""Reports are held against the noise: bounds of one fit, outliers of what is left, short logs."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def robot() -> Robot:
 
 @cache
 def found() -> Result:
-    """What identify says where the body rubs: swings of many sizes, with holds."""
+    """Return what identify says where the body rubs: swings of many sizes, with holds."""
     t = 0.1 * np.arange(N)
     size = 0.55 + 0.45 * np.cos(0.23 * t)
     held = np.where((t > 12.0) & (t < 15.0), 12.0, t)

@@ -97,7 +97,7 @@ def test_each_family_is_the_name_of_its_own_pattern(outside: str, seed: int, fam
 
 @pytest.mark.parametrize("seed", [2, 4])
 def test_a_contact_is_static_whatever_its_name(seed: int) -> None:
-    """Of six walls, these two (normals near a tendon's plane) fit a patch better; why is not known."""
+    """Two walls of six (normals near a tendon's plane) fit a patch better; why is not known."""
     scores = ranked(residual(planted("contact", seed)))
     assert [alternative.name for _, alternative in scores[:2]] in (["patch", "contact"], ["contact", "patch"])
     assert scores[0][1].kind == "static"

@@ -88,7 +88,7 @@ def log(robot: Robot, n: int = N) -> RunLog:
 
 
 def stepped(robot: Robot, what: RunLog) -> PredictedPose:
-    """What a simulator of the robot measures, settled at every sample, its clock that of the log."""
+    """Return what a simulator of the robot measures, settled at every sample, its clock that of the log."""
     sim = Simulator(robot, points_per_segment=N_STEPS)
     seen = []
     for i in range(len(what)):
@@ -197,7 +197,7 @@ def test_a_run_that_continues_another_continues_its_memories() -> None:
 
 
 def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
-    """Of what tendons did; bends between the rows are interpolated."""
+    """The memory of tendons goes on; bends between the rows are interpolated."""
     robot = having(two_segments(), *(m for m in MEMORIES if not reads_bend(get_effect(m["name"]))))
     what = log(robot)
     whole = predicted(robot, what)

@@ -1,4 +1,4 @@
-"""What the rod's state cannot hold is said of the robots that show it, and of no others."""
+"""Limits of the rod's state are reported for the robots that show them, and for no others."""
 
 from __future__ import annotations
 

@@ -78,7 +78,8 @@ def commands(seed: int, t: np.ndarray) -> np.ndarray:
 
 
 def recorded(plant: Robot, runs: dict[str, int], t: np.ndarray, noise: float, step: float = 5e-4) -> RunLog:
-    """What a plant does in motion at a time step finer than the fit's, with noise; a run for each seed."""
+    """Return what a plant does in motion at a time step finer than the fit's, with noise; a run for each
+    seed."""
     dl = np.concatenate([commands(seed, t) for seed in runs.values()])
     labels = np.repeat(list(runs), len(t))
     log = RunLog(
@@ -177,7 +178,7 @@ def let_it_go(damping: float, seconds: float) -> tuple[RunLog, Robot]:
 
 @pytest.mark.study
 def test_inertia_and_damping_are_named_where_a_robot_was_let_go() -> None:
-    """From a file that has a mass and no damping, asked at rest: the log does not say how it was held."""
+    """A file that has a mass and no damping, evaluated at rest: the log does not say how it was held."""
     log, bare = let_it_go(0.01, 2.0)
     still = replace(bare, segments=(replace(bare.segments[0], damping_time=0.0),))
     found = identify(log, still, held_out=["b"])

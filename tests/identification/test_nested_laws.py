@@ -20,7 +20,7 @@ from fastrod.model.routing import route
 from fastrod.types import Floats
 
 STDERR = 1e-2
-"""Of every fitted number of `fitted`."""
+"""Standard errors of every fitted number of `fitted`."""
 
 
 def fitted(name: str, **numbers: float) -> ModelState:

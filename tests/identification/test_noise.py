@@ -76,7 +76,8 @@ def test_noise_at_rest(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_without_rest(seed: int) -> None:
-    """From the fastest of a residual with slow structure: a median of 2250 third differences, 3 to 4 %."""
+    """The fastest part of a residual with slow structure is its noise: a median of 2250 third differences,
+    3 to 4 %."""
     residual = white(seed, LONG) + smooth(seed, LONG)
     found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
     assert "never rests" in found.how
@@ -102,7 +103,8 @@ def test_noise_without_rest_with_outliers(seed: int) -> None:
 
 
 def test_noise_alone_exceeds_its_limit_once_in_forty_times() -> None:
-    """Of 4000 means over 200 rows in three axes, 2.3 % are above (to 0.24 %); coloured rows are fewer."""
+    """The limit over 4000 means of 200 rows in three axes is exceeded by 2.3 % (to 0.24 %); coloured rows
+    are fewer."""
     white = Noise(np.ones(3), 0.0, "given")
     x = np.random.default_rng(0).normal(size=(4000, 200, 3))
     above = np.mean(np.sqrt((x**2).sum(2).mean(1)) > white.most(200))

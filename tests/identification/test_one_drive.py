@@ -99,7 +99,7 @@ def rod_of_one_drive() -> Robot:
 
 @cache
 def found(name: str, drives: tuple[int, ...]) -> Result:
-    """What is found in a run of 40 s with holds, the sealed drives worn."""
+    """Return what is found in a run of 40 s with holds, the sealed drives worn."""
     robot = one_segment()
     t = 0.1 * np.arange(400)
     held = np.where((t > 15.0) & (t < 22.0), 15.0, t)

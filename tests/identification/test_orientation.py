@@ -35,7 +35,8 @@ def seen(robot: Robot, run: RunLog) -> tuple[np.ndarray, Rotation]:
 
 @pytest.fixture(scope="module")
 def late(nominal: Robot) -> RunLog:
-    """What a camera measures that is two samples late, of a robot a tenth stiffer than its file says."""
+    """Return what a camera measures that is two samples late, of a robot a tenth stiffer than its file
+    says."""
     run = excitation(nominal).log
     (segment,) = nominal.segments
     stiffer = tuple(1.1 * k for k in segment.bending_stiffness)

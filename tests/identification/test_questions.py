@@ -1,4 +1,4 @@
-"""What a log of another camera, of mixed-up inputs or another unit makes `identify` and `replay` do."""
+"""Questions of `identify` and `replay` on a log of another camera, of mixed-up inputs or another unit."""
 
 from __future__ import annotations
 

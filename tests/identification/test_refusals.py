@@ -1,4 +1,4 @@
-"""What cannot be excited, held out, merged or fitted is one sentence."""
+"""A log that cannot be excited, held out, merged or fitted gives one sentence."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ ANOTHER_DAY: tuple[dict[str, Any], ...] = (
 
 
 def day(*effects: dict[str, Any], session: str, seed: int) -> RunLog:
-    """What a worn robot does on a day."""
+    """Return what a worn robot does on a day."""
     robot = one_segment(effects=(WORN, *effects))
     log = log_of(robot, wave(robot, N, DT, seed=seed), DT, name=session, session=np.full(N, session))
     tip = replay(log, robot).tip_position + NOISE * np.random.default_rng(seed).normal(size=(N, 3))

@@ -99,7 +99,7 @@ def test_a_trial_that_is_no_robot_is_a_worse_trial() -> None:
 
 
 def test_a_step_that_leads_to_worse_is_halved() -> None:
-    """Where a fit along slopes has led far beyond what they say, the rod is solved nearer to where it was."""
+    """A fit along slopes that has led far beyond them is solved nearer to where it was."""
     samples, model = at_the_limit(), base_model(robot())
     tip = predict(model, model.start, samples, PredictedRod(samples, robot())).position
     samples = replace(samples, log=replace(samples.log, tip_position=tip))

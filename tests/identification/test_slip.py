@@ -35,7 +35,7 @@ def test_a_slip_is_a_zero_that_is_off_from_its_time_on() -> None:
 
 @cache
 def found(*names: str) -> Result:
-    """What is found in a run of 50 s."""
+    """Return what is found in a run of 50 s."""
     robot = one_segment()
     log = log_of(robot, wave(robot, 500, dt=0.1), 0.1)
     sealed = tuple({"slip": SLIP, "backlash": LASH}[name] for name in names)
@@ -72,7 +72,7 @@ def test_no_slip_is_named_where_none_was() -> None:
 
 @pytest.mark.study
 def test_runs_keep_their_own_time() -> None:
-    """Of two runs a time since the start is ambiguous: the pattern stays one."""
+    """The time since the start is ambiguous for two runs: the pattern stays one."""
     robot = two_segments()
     log = log_of(robot, wave(robot, 500, dt=0.1), 0.1)
     slipped = replace(robot, effects=({"name": "slip", "step": [0.0, 6e-4, 0.0, 0.0], "at": 0.0},))

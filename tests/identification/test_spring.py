@@ -35,7 +35,7 @@ def soft(robot: Robot) -> Robot:
 
 @cache
 def found(name: str) -> Result:
-    """What is found in a run of 50 s to all sides."""
+    """Return what is found in a run of 50 s to all sides."""
     sealed: dict[str, Any] = {"tip_spring": SPRING, "tip_force": FORCE}[name]
     robot = soft(one_segment())
     log = log_of(robot, wave(robot, 500, dt=0.1, size=0.9), 0.1)
@@ -68,7 +68,7 @@ def test_a_constant_force_stays_one() -> None:
 
 @pytest.mark.parametrize("there", [0.0, 3.0], ids=["none at the reference", "one at the reference"])
 def test_the_linearised_model_has_the_spring_in_balance(there: float) -> None:
-    """What it says is off by the square of the way from its reference."""
+    """The error is the square of the distance from its reference."""
     robot = soft(two_segments())
     log = log_of(robot, wave(robot, 40))
     samples = sample(log)

@@ -53,7 +53,7 @@ def measured(*, pulls: bool) -> RunLog:
 
 @cache
 def found() -> Result:
-    """What identify says of it with the push-pull file."""
+    """Return what identify says of it with the push-pull file."""
     return identify(measured(pulls=True), built(pulls=False))
 
 

@@ -33,7 +33,7 @@ def three() -> Robot:
 
 @cache
 def found(*names: str) -> Result:
-    """What is found in a run of 50 s that pulls every tendon alone and every two together."""
+    """Return what is found in a run of 50 s that pulls every tendon alone and every two together."""
     robot, t = three(), 0.1 * np.arange(500)
     phase = 2.0 * np.pi * np.arange(3) / 3.0
     size = 0.004 * (1.0 + 0.7 * np.sin(0.9 * t))[:, None]

@@ -25,7 +25,7 @@ ROTATING = {"name": "rotation_drift", "x": 1e-4, "y": -2e-4, "z": 3e-4}
 
 @cache
 def found(name: str) -> Result:
-    """What is found in a run of 150 s whose camera drifts."""
+    """Return what is found in a run of 150 s whose camera drifts."""
     sealed: dict[str, Any] = {each["name"]: each for each in (LINEAR, SETTLING, ROTATING)}[name]
     robot = one_segment()
     log = log_of(robot, wave(robot, 500, dt=0.3), 0.3)
@@ -58,7 +58,8 @@ def test_a_steady_drift_stays_one() -> None:
 
 @cache
 def rubbing(name: str) -> Result:
-    """What is found in a run of 60 s with tendons that stretch and rub, a mass on the tip on and off."""
+    """Return what is found in a run of 60 s with tendons that stretch and rub, a mass on the tip on and
+    off."""
     sealed: dict[str, Any] = {"friction": FRICTION, "capstan_friction": CAPSTAN}[name]
     (segment,) = one_segment().segments
     slack = tuple(replace(tendon, compliance=5e-4, pretension=3.0) for tendon in segment.tendons)

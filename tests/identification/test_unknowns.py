@@ -1,4 +1,4 @@
-"""What is not known: the words of a robot file, the vector they make, and the robot that a vector makes."""
+"""The unknowns: the words of a robot file, the vector they make, and the robot that a vector makes."""
 
 from __future__ import annotations
 

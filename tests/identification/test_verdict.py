@@ -110,7 +110,7 @@ def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> 
 
 
 def test_borders_are_in_order() -> None:
-    """What the words must mean: half of the squares left is not partly explained."""
+    """The words in order: half of the squares left is not partly explained."""
     assert 0.01 <= _EXPLAINED <= 0.12
     assert 0.2 <= _PARTLY <= 0.5
     assert _EXPLAINED < _FOREIGN <= _PARTLY

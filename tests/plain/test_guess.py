@@ -1,4 +1,4 @@
-"""Where a cold start begins: closed forms, and the kernel against its obvious twin. Small enough to run
+"""Start of a cold solve: closed forms, and the kernel against its obvious twin. Small enough to run
 without the compiler."""
 
 from __future__ import annotations

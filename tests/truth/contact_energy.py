@@ -99,7 +99,7 @@ class Patch(NamedTuple):
     """A run of neighbouring nodes that carry force."""
 
     arclength: float
-    """Where the force acts in the mean [m]."""
+    """Mean arclength at which the force acts [m]."""
     first: float
     """Arclength of its first node [m]."""
     last: float

@@ -132,7 +132,8 @@ def _unit(a: ArrayLike) -> Floats:
 
 
 def _length_and_direction(v: Floats) -> tuple[Floats, Floats]:
-    """Of (p, 3); on the point itself a zero vector, and a length that can divide."""
+    """Return length and direction of (p, 3); on the point itself a zero vector, and a length that can
+    divide."""
     d = np.linalg.norm(v, axis=1)
     some = np.maximum(d, 1e-12)
     return some, v / some[:, None]

@@ -248,6 +248,6 @@ def _rotation(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _turning(w: NDArray[Any]) -> NDArray[Any]:
-    """How exp [w]x turns, in the frame it starts from, when w changes: the left Jacobian of SO(3)."""
+    """Return how exp [w]x turns, in the frame it starts from, when w changes: the left Jacobian of SO(3)."""
     k, square = _hat(w), np.sum(w * w, axis=-1)[..., None, None]
     return np.asarray(np.eye(3) + _series(square, 2) * k + _series(square, 3) * (k @ k))

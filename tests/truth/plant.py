@@ -36,12 +36,12 @@ plastic_set time_drift temperature latency second_order_lag frame_misalignment m
 """
 LIBRARY = tuple(_LIBRARY.split())
 OUTSIDE = ("bump", "sway", "ripple", "contact", "slip", "magnet")
-"""What no library has: the verdict on these is "not in the library"."""
+"""Seals outside the library: the verdict on these is "not in the library"."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the robot was commanded and what is known of its surroundings, a row per sample."""
+    """Commands of the robot and its known surroundings, a row per sample."""
 
     t: Array
     """(n,) [s], increasing."""
@@ -59,12 +59,12 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Seal:
-    """What is hidden in the plant; open it only to judge a verdict."""
+    """Effects hidden in the plant; open it only to judge a verdict."""
 
     effects: dict[str, dict[str, Any]]
     """Name -> parameters in SI units and radians."""
     seed: int
-    """Of the draw; the noise follows from it too."""
+    """Seed of the draw; the noise follows from it too."""
 
 
 # ---------------------------------------------------------------- draws
@@ -490,7 +490,8 @@ def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:
 
 
 def operator_inputs(rng: np.random.Generator, segments: int = 1, seconds: float = 150.0) -> Inputs:
-    """What an operator does by hand at 15 Hz: smooth wandering with a few holds, one orientation, no load."""
+    """Return what an operator does by hand at 15 Hz: smooth wandering with a few holds, one orientation,
+    no load."""
     t = np.arange(int(15.0 * seconds)) / 15.0
     clock = np.where((t % 37.0) > 34.0, 0.0, 1.0).cumsum() / 15.0  # it stands still in a hold
     bend = np.stack([_wander(rng, clock, clock[-1] + 1.0, 2.2, 0.8) for _ in range(segments)], axis=1)
@@ -508,7 +509,7 @@ def _wander(rng: np.random.Generator, x: Array, seconds: float, every: float, re
 
 
 def main() -> None:
-    """How far each effect moves the tip on the designed log (rms over the samples, mm)."""
+    """Print how far each effect moves the tip on the designed log (rms over the samples, mm)."""
     segments = int(sys.argv[1]) if len(sys.argv) > 1 else 1
     logs = [designed_inputs(np.random.default_rng(seed), segments) for seed in range(3)]
     bare = [pose(log, draw(0, "none"))[0] for log in logs]

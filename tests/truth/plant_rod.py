@@ -21,15 +21,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Field = Callable[[Array], tuple[Array, Array]]
-"""Of tip positions (n, 3) [m]: force (n, 3) [N] and its change with the position (n, 3, 3) [N/m]."""
+"""Field of tip positions (n, 3) [m]: force (n, 3) [N] and its change with the position (n, 3, 3) [N/m]."""
 
 LENGTH, EI, GJ, OFFSET, COMPLIANCE, GRAVITY = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5, 9.81
-"""Of each segment: m, N m^2, N m^2, m; of each tendon m/N; m/s^2 along -z of the world."""
+"""Constants of each segment: m, N m^2, N m^2, m; of each tendon m/N; m/s^2 along -z of the world."""
 _NODES, _MODES = 8, 5
 
 
 def angles(segments: int) -> Array:
-    """Of the tendons (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
+    """Return the angles of the tendons (tendons,) [rad]: each segment's four are 45 degrees on from those
+    of the one before."""
     return np.concatenate([0.25 * np.pi * k + 0.5 * np.pi * np.arange(4) for k in range(segments)])
 
 
@@ -84,9 +85,9 @@ class Rod:
 
     segments: int = 1
     compliance: float = COMPLIANCE
-    """Of each tendon [m/N]."""
+    """Compliance of each tendon [m/N]."""
     angle: Array | None = None
-    """Of the tendons (tendons,) [rad]; None: where they belong."""
+    """Angles of the tendons (tendons,) [rad]; None: where they belong."""
     stiffness: Array | None = None
     """(nodes, 3, 3) [N m^2]; None: uniform."""
     precurvature: Array | float = 0.0
@@ -104,8 +105,8 @@ class Rod:
         lever: float = 0.0,
         field: Field | None = None,
     ) -> tuple[Array, Array]:
-        """Where the energy is least: chords of the segments (n, segments, 3) [m] and rotations of the tip (n,
-        3, 3).
+        """Return where the energy is least: chords of the segments (n, segments, 3) [m] and rotations of the
+        tip (n, 3, 3).
 
         - `dl` (n, tendons) [m]; `tip_force` (n, 3) [N] and `down` (n, 3) [m/s^2], the acceleration of
           gravity, in the base frame.

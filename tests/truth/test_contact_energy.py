@@ -64,7 +64,7 @@ def test_wires_that_stretch_press_less() -> None:
 
 @pytest.mark.study
 def test_bent_far_the_planar_answer_is_a_ridge() -> None:
-    """From a mean curvature of about 12.4 1/m the tip slides along the wall and leaves the plane."""
+    """The tip slides along the wall and leaves the plane from a mean curvature of about 12.4 1/m."""
     assert pressed(12.0, 1e-5).stability > 0.05
     ridge, valley = pressed(16.0, 1e-5, planar=True), pressed(16.0, 1e-5, nudge=[0.0, 0.01, 0.0])
     assert ridge.stability < -0.5
@@ -110,7 +110,8 @@ def test_signorini(name: str) -> None:
 @pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
-    """Where phi is least its normal has no component along the rod; a node that held it would fail this."""
+    """The normal has no component along the rod at the minimum of phi; a node that held it would fail
+    this."""
     found = at_rest(name)
     for i in np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-6):
         # both sides are arcs of one curvature: the tangent is the mean of both chords, weighted

@@ -43,7 +43,7 @@ def robot_of(case: dict[str, Any]) -> Robot:
 
 
 def inputs_of(case: dict[str, Any]) -> Inputs:
-    """What acts from t = 0 on."""
+    """Return what acts from t = 0 on."""
     if "tendon" in case:
         t_end, change = case["tendon"]["ramp"], case["tendon"]["offset"] * case["tendon"]["bend"]
 

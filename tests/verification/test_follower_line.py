@@ -134,7 +134,7 @@ def test_in_motion_it_comes_to_rest_where_it_rests() -> None:
 
 @pytest.mark.study
 def test_a_step_has_second_order() -> None:
-    """Of a load that grows: by how much the tip moves as the step is halved, and halved again."""
+    """A load grows: by how much the tip moves as the step is halved, and halved again."""
     robot = rod(density=0.3, damping_time=0.01)
     tips = {}
     for n in (160, 320, 640, 1280):

@@ -88,7 +88,7 @@ def imbalance(base: Base, dt: float, scheme: str) -> np.ndarray:
 @pytest.mark.parametrize("scheme", ["bdf2", "generalized_alpha"])
 @pytest.mark.parametrize("base", [shaken, spun])
 def test_what_the_base_gives_is_the_change_of_momentum(base: Base, scheme: str) -> None:
-    """What is left falls with about the square of the step (the tendons ring at frequencies near 1/dt), so
+    """The error falls with about the square of the step (the tendons ring at frequencies near 1/dt), so
     that no force and no inertia is missing."""
     coarse, fine = (imbalance(base, dt, scheme) for dt in (2e-4, 1e-4))
     assert_allclose(np.log2(np.linalg.norm(coarse) / np.linalg.norm(fine)), 2.0, atol=0.3)

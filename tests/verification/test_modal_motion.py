@@ -117,7 +117,7 @@ def test_it_is_second_order_in_time_after_a_sudden_load_too(story: Any, scheme: 
 
 
 def first_mode(x: np.ndarray) -> np.ndarray:
-    """Of a cantilever, at fractions of its length."""
+    """First mode of a cantilever, at fractions of its length."""
     b = BENDING[0]
     sigma = (math.sinh(b) - math.sin(b)) / (math.cosh(b) + math.cos(b))
     return np.asarray(np.cosh(b * x) - np.cos(b * x) - sigma * (np.sinh(b * x) - np.sin(b * x)))

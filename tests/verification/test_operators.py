@@ -63,12 +63,12 @@ def delayed(path: np.ndarray, lag: float, dt: np.ndarray) -> np.ndarray:
 
 
 def yielded_in_plane(path: np.ndarray) -> np.ndarray:
-    """Of bends (n, 2): a share of 0.2 beyond 0.5."""
+    """Yielded in plane of bends (n, 2): a share of 0.2 beyond 0.5."""
     return through(yielding, path, 2, 0.2, 0.5)
 
 
 def yielded(path: np.ndarray) -> np.ndarray:
-    """Of a bend that keeps its plane."""
+    """Yielded of a bend that keeps its plane."""
     plane = np.array([0.6, -0.8])
     found = yielded_in_plane(path[:, None] * plane)
     assert_allclose(found @ [0.8, 0.6], 0.0, atol=ROUNDING)

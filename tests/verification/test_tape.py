@@ -72,7 +72,8 @@ def cost(tips: Tips) -> tuple[np.ndarray, Tips]:
 
 
 def difference(change: Any, step: float, **options: Any) -> float:
-    """Of the cost, to the fourth order: `change` returns robot, tendons and forces at a signed step."""
+    """Difference of the cost, to the fourth order: `change` returns robot, tendons and forces at a signed
+    step."""
 
     def slope(h: float) -> float:
         up, down = (float(cost(run(*change(end), **options)[1].tips())[0][0]) for end in (h, -h))

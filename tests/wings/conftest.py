@@ -1,4 +1,4 @@
-"""What a test opens is closed after it."""
+"""Close after a test what it opened."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing

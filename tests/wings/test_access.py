@@ -28,7 +28,7 @@ from fastrod_viewer.worlds import FreeWorld
 
 @pytest.fixture(scope="module", params=["viewer", "replay", "drive", "environments"])
 def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Of each kind of page there is."""
+    """Address of each kind of page."""
     folder = tmp_path_factory.mktemp("access")
     if request.param == "drive":
         with Popen(DRIVE, cwd=folder, stdout=PIPE, stderr=PIPE, text=True) as process:
@@ -231,7 +231,7 @@ def camera(*values: object) -> dict[str, object]:
 
 
 def nonsense(uuid: str) -> dict[str, bytes | str]:
-    """What a page may send that makes no sense; `uuid` of a slider."""
+    """Return what a page may send that makes no sense; `uuid` of a slider."""
     update = {"type": "GuiUpdateMessage", "uuid": uuid}
     upload = {"type": "FileTransferStartUpload", "source_component_uuid": uuid, "transfer_uuid": "t"}
     upload |= {"filename": "f", "mime_type": "m", "part_count": 0, "size_bytes": 0}

@@ -1,4 +1,4 @@
-"""What the device's parts cannot do is refused in one sentence: a row is what is given, and what is said."""
+"""Impossible demands on the device's modules give one sentence: a row is what is given, and what is said."""
 
 import math
 from dataclasses import replace

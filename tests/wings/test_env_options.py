@@ -1,4 +1,4 @@
-"""What an environment can be given: its options, randomised robots, difficulty, and how it is shown."""
+"""Options of an environment: its options, randomised robots, difficulty, and how it is shown."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""What every registered task owes to Gymnasium and to its users, whatever it is about."""
+"""Contracts of every registered task with Gymnasium and with its users."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -289,7 +289,7 @@ def test_huge_actions_are_finite() -> None:
 
 
 def test_episodes_that_begin_in_the_next_step_are_the_same_episodes() -> None:
-    """As Gymnasium's vector wrappers want it: the step after an end heeds no action and brings no reward."""
+    """Gymnasium's vector wrappers want it so: the step after an end heeds no action and brings no reward."""
     same, following = (BatchEnv("Reach", 3, autoreset=mode) for mode in ("same_step", "next_step"))
     first = [batch.reset(seed=5)[0] for batch in (same, following)]
     assert_array_equal(*first)

@@ -65,7 +65,7 @@ def rig():
 
 
 def torque(*tension):
-    """Of all drives [thousandths of the rated one], at tensions [N]."""
+    """Return the torque of all drives [thousandths of the rated one], at tensions [N]."""
     return {"torque": Transmission(HARDWARE.drives).torque(np.array(tension))}
 
 

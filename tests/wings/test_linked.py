@@ -1,4 +1,4 @@
-"""What links offer beyond driving and reading is found and used; a link without it is driven all the same."""
+"""Optional offers of links are found and used; a link without it is driven all the same."""
 
 import time
 from enum import Enum

@@ -255,7 +255,7 @@ def test_a_first_look_at_a_measured_set_refuses_nothing(name: str) -> None:
 @needs_data
 @pytest.mark.study
 def test_order_signs_and_angles_of_nine_servos_are_found_from_the_authors_file(tmp_path: Path) -> None:
-    """From a file that knows nothing of them: each segment's tendons at any angle, positive pulls."""
+    """A file that knows nothing of the servos: each segment's tendons at any angle, positive pulls."""
     raw = DATA / "opencr_ftv4_train.csv"
     words = "--segments 3 --tendons 3 --length 60,62.5,64 --offset 4.5 --drive pull"
     assert main(["new", str(tmp_path / "a.toml"), "--log", str(raw), *words.split()]) == 0

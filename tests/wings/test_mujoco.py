@@ -304,7 +304,7 @@ def mounted(**options):
 
 
 def felt(inside, body):
-    """What a rod may touch of a model."""
+    """Bodies of a model that a rod may touch."""
     model = spec_of(inside).compile()
     data, number = mujoco.MjData(model), model.body(body).id
     MujocoBodyContact(model, data, number, dt=0.005, relaxation=0.1, friction=0.3)

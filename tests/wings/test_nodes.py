@@ -87,7 +87,7 @@ class Line:
         return status, position
 
     def enable(self):
-        """As `map`, where that was not done, and enabled."""
+        """See `map`, where that was not done, and enabled."""
         if not self.mapped:
             self.map()
         self.takes((0x6060, 0, 8, 1))

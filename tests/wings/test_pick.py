@@ -36,7 +36,7 @@ def pull(stage: Picking) -> float:
 @pytest.mark.study
 @pytest.mark.parametrize("scene", [PickSuction, PickGripper])
 def test_the_held_cube_has_its_weight(scene: type[PickSuction | PickGripper]) -> None:
-    """What holds it up is m (g + a), a by differences of its velocity; its mass is the given one."""
+    """The holding force is m (g + a), a by differences of its velocity; its mass is the given one."""
     stage = scene(Cube(mass=0.1)).stage()
     before, needed, found = 0.0, [], []
     for _ in scene().play(stage):

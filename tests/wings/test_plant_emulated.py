@@ -36,7 +36,7 @@ def tendons(bend_x: float, bend_y: float) -> np.ndarray:
 
 
 def bend_of(rotation: np.ndarray) -> float:
-    """Of a planar shape, by its tip [rad]."""
+    """Bend of a planar shape, by its tip [rad]."""
     return math.acos(min(1.0, rotation[2, 2]))
 
 
@@ -483,7 +483,7 @@ def test_what_was_opened_is_a_copy() -> None:
 
 
 def test_the_plant_stands_alone() -> None:
-    """Of the simulator it may know the errors and the names of array types."""
+    """The plant may import the simulator's errors and the names of array types."""
     for module in (plant, plant_rod, sys.modules[Seal.__module__]):
         lines = [
             line

@@ -45,7 +45,7 @@ BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 
 
 def bench(clock: Clock | None = None, *, hardware: Any = HARDWARE, **how: Any) -> Any:
-    """As `benches.started`, of the prototype's own hardware."""
+    """See `benches.started`, of the prototype's own hardware."""
     return started(hardware, clock, **how)
 
 

@@ -26,7 +26,7 @@ BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 
 
 def bench(clock: Clock | None = None, *, hardware: Any = HARDWARE, **how: Any) -> Any:
-    """As `benches.started`, of the prototype's own hardware."""
+    """See `benches.started`, of the prototype's own hardware."""
     return started(hardware, clock, **how)
 
 
@@ -48,7 +48,7 @@ class Attack:
         return frame
 
     def old(self) -> CameraFrame:
-        """From when the robot stood elsewhere."""
+        """Return a frame of another pose."""
         return self.frames[self.n // 2]
 
     def corner(self) -> Picture:

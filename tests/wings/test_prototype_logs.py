@@ -29,7 +29,7 @@ HARDWARE = load_hardware()
 
 
 def bench(clock: Clock | None = None, *, hardware: Any = HARDWARE, **how: Any) -> Any:
-    """As `benches.started`, of the prototype's own hardware."""
+    """See `benches.started`, of the prototype's own hardware."""
     return started(hardware, clock, **how)
 
 

@@ -67,7 +67,7 @@ def pulled(world: FreeWorld, teleop: Teleop, fraction: float) -> None:
 
 
 def frequency_of(signal: np.ndarray, dt: float) -> float:
-    """From its zero crossings upward [Hz]."""
+    """Return the frequency from its zero crossings upward [Hz]."""
     signal = signal - 0.5 * (signal.max() + signal.min())
     up = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
     at = up + signal[up] / (signal[up] - signal[up + 1])

@@ -1,4 +1,4 @@
-"""What `fastrod train --set` takes: an algorithm's settings, checked before anything is made."""
+"""Settings of `fastrod train --set`: an algorithm's settings, checked before anything is made."""
 
 import inspect
 import re

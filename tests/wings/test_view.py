@@ -169,7 +169,7 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
 
 
 def _address() -> str:
-    """Of this machine as others see it, or a loopback address that nobody serves."""
+    """Address of this machine on its network, or a loopback address that nobody serves."""
     address = socket.gethostbyname(socket.gethostname())
     return "127.0.0.2" if address.startswith("127.") else address
 

@@ -1,4 +1,4 @@
-"""What a PyBullet world looks like: the triangles stand where PyBullet's own camera sees them."""
+"""Look of a PyBullet world: the triangles stand where PyBullet's own camera sees them."""
 
 import numpy as np
 import pytest

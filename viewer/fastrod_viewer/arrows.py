@@ -96,7 +96,7 @@ class Trail:
     """Trail of a point: a line that fades toward its old end."""
 
     def __init__(self, capacity: int, min_step: float) -> None:
-        """Of `capacity` pieces, each at least `min_step` [m] long. Raises `InputError`."""
+        """Make a trail of `capacity` pieces, each at least `min_step` [m] long. Raises `InputError`."""
         if capacity < 1 or not min_step >= 0.0:
             raise InputError(
                 f"a trail of {capacity} pieces of {min_step} m cannot be; give one piece or "

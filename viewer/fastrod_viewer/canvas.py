@@ -44,7 +44,7 @@ class Canvas:
 
     @property
     def names(self) -> frozenset[str]:
-        """Of the batches that are drawn now."""
+        """Names of the batches that are drawn now."""
         return frozenset(self._batches)
 
     def clear(self) -> None:

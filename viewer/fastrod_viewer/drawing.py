@@ -46,7 +46,7 @@ class Drawing:
         rods = world.rods[0]
         self.middle, self.size = bounds(rods, world.bodies, world.poses())
         self.radius = max(rods.radius)
-        """Of the robot's body [m]."""
+        """Radius of the robot's body [m]."""
         self._pictures = [Picture(r, options) for r in world.rods]
         self._trails = self._new_trails()
         self._track = Trail(_TRAIL, 0.3 * self.radius)
@@ -147,7 +147,7 @@ class Drawing:
         )
 
     def _new_trails(self) -> list[list[Trail]]:
-        """Of each robot, where they are few."""
+        """Make the trails of each robot, where they are few."""
         counts = [len(rods.state.tip_position) for rods in self.world.rods]
         return [[Trail(_TRAIL, 0.6 * self.radius) for _ in range(n if n <= FINE else 0)] for n in counts]
 

@@ -242,7 +242,7 @@ class DrivePage(ViewerPage):
         return f"<small>{keys}</small>"
 
     def _hint(self) -> str:
-        """What to try, in a sentence."""
+        """Return what to try, in a sentence."""
         if self.world.ringing is not None:
             return "Pull the ball at its tip, and let go."
         if self._can_drag():

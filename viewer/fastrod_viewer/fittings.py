@@ -32,7 +32,7 @@ def warned(color: Colors, bad: Flags) -> Colors:
 
 
 def smallest_offset(params: Params) -> float:
-    """Of all tendons from the backbone [m]; 0 without tendons."""
+    """Smallest offset of all tendons from the backbone [m]; 0 without tendons."""
     distance = np.linalg.norm(params.offset, axis=-1)
     return float(distance[distance > 0.0].min(initial=np.inf)) if distance.any() else 0.0
 

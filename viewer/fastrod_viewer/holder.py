@@ -15,8 +15,8 @@ AGAIN = 10.0
 """s after a refusal in which requests of the same page are ignored."""
 
 Standing = Literal["free", "has", "requested", "other", "asking", "refused"]
-"""Of one page: the controls are free; it has them; another page requests them from it; another has them; it
-requests them; its request was refused."""
+"""State of one page: the controls are free; it has them; another page requests them from it; another has
+them; it requests them; its request was refused."""
 
 
 @final

@@ -59,7 +59,7 @@ class HolderPanels:
 
 @final
 class _Panel:
-    """Of one page."""
+    """Panel of one page."""
 
     def __init__(self, client: Any, holder: Holder) -> None:
         gui, page = client.gui, client.client_id

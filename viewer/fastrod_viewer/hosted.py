@@ -106,7 +106,7 @@ class HostedView(StagedView):
     _stage: HostedWorld
     _kinematics: SoftTip | None
     _joints: Floats | None
-    """Where manual commands drive the arm."""
+    """Joints of the arm where manual commands drive it."""
     _base: Floats | None
     """The last that the arm has followed; None: something else has moved it since."""
     _frozen: bool

@@ -43,7 +43,7 @@ class Legend:
 
     title: str
     unit: str
-    """Of the ticks; empty where there are none."""
+    """Unit of the ticks; empty where there are none."""
     entries: tuple[Entry, ...] = ()
     ticks: tuple[Tick, ...] = ()
     """Evenly spaced from the left end of the bar to the right."""
@@ -100,7 +100,7 @@ def _number(value: float) -> str:
 
 
 def legend(rods: DrawnRods, options: ViewOptions, picture: Picture) -> Legend:
-    """Of a picture of `rods` with these options, with its ranges as they are now."""
+    """Legend of a picture of `rods` with these options, with its ranges as they are now."""
     title, unit = _TITLES[options.color_by]
     robot = rods.robots[0]
     problem = () if bool(rods.state.ok.all()) else (Entry("not solved", palette.PROBLEM),)

@@ -57,7 +57,7 @@ class LiveWorld(World):
         return self._bodies
 
     def poses(self) -> Floats:
-        """Where they stand."""
+        """Return where they stand."""
         return np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(self._bodies), 1))
 
     def play(self) -> None:

@@ -9,8 +9,8 @@ from fastrod.errors import InputError, nearest
 COLOR_BY: tuple[str, ...] = ("segment", "curvature", "strain", "tension")
 BODIES: tuple[str, ...] = ("backbone", "skin")
 FINE = 16
-"""Of more robots than this, spacers and tendons are not drawn, whatever the options say: the browser would
-have too much to do."""
+"""Largest number of robots for which spacers and tendons are drawn, whatever the options say: the browser
+would have too much to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,9 +25,9 @@ class ViewOptions:
     tendons hidden, but with
     `color_by="tension"` drawn on it."""
     tendons: bool = True
-    """Of up to 16 robots."""
+    """Whether tendons are drawn, of up to 16 robots."""
     spacers: bool = True
-    """Of up to 16 robots."""
+    """Whether spacers are drawn, of up to 16 robots."""
     contacts: bool = True
     loads: bool = True
     frames: bool = False

@@ -78,7 +78,7 @@ DIVERGING: Colors = _table(
 
 
 def segment_color(k: int) -> Color:
-    """Of segment k, counted from 0; after the tenth they begin again."""
+    """Colour of segment k, counted from 0; after the tenth they begin again."""
     return SEGMENTS[k % len(SEGMENTS)]
 
 

@@ -98,7 +98,7 @@ class Picture:
             "tension": 0.05 * float(params.tension_scale.max()),
         }
         self.range: Range | None = Range(least[options.color_by]) if options.color_by in least else None
-        """Of colours that stand for numbers [1/m, % or N]; it grows with what is seen."""
+        """Range of colours that stand for numbers [1/m, % or N]; it grows with what is seen."""
         self._contacts = (
             (32 if self.n_robots <= 4 else 8) if options.contacts and state.contacts is not None else 0
         )

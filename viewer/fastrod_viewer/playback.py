@@ -64,7 +64,7 @@ class PlayedTrack:
     residual: Floats
     """(n,) distance between measured and predicted tip [m]; nan where either is missing."""
     rms: float
-    """Of `residual` over the whole log [m]."""
+    """Rms of `residual` over the whole log [m]."""
     shapes: PlayedShapes
 
     def rms_of(self, rows: Flags) -> float:
@@ -170,7 +170,7 @@ class Playback:
 
     @property
     def duration(self) -> float:
-        """Of the whole playback [s]."""
+        """Duration of the whole playback [s]."""
         return float(self.time[-1])
 
     @property

@@ -15,7 +15,7 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 FARTHEST_PULL = 0.25
-"""Of the robot's length: the spring of a drag is as strong at every larger distance."""
+"""Fraction of the robot's length: the spring of a drag is as strong at every larger distance."""
 _STIFFER = 10.0  # the spring of a drag, times the tip's stiffness in its softest direction, at most
 _SLOW = 0.25  # of that stiffness, times the square of the first mode's angle in a step: more grows by itself
 _FEWEST, _ENOUGH = 10.0, 20.0  # steps in a period: fewer are refused, or taken only where asked for
@@ -42,10 +42,10 @@ class Ringing:
         angle = 2.0 * math.pi * self.frequency * simulator.dt
         stiffer = min(_STIFFER, _SLOW / angle**2)
         self.stiffness = stiffer * softest
-        """Of the drag's spring [N/m]."""
+        """Stiffness of the drag's spring [N/m]."""
         together = 2.0 * math.pi * self.frequency * math.sqrt(1.0 + stiffer)
         self.damping = self.stiffness * (simulator.dt + 2.0 * _DAMPED / together)
-        """Of its damper [N s/m]."""
+        """Damping of its damper [N s/m]."""
         self._farthest = FARTHEST_PULL * simulator.robots[0].length
         self._dt = simulator.dt
         self._enough = max(0.5 / self.frequency, _FEW * simulator.dt)

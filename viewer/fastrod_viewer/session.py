@@ -43,7 +43,7 @@ class ViewFrame:
     command: ManualCommand | None
     """The last command; None before the first, and where its script moves the world."""
     measured: Measurement | None
-    """Of a robot that is not the world itself."""
+    """The measured robot, where it is not the world itself."""
     latency: float
     """Time from the oldest input that this picture answers to the end of its computation [s]; nan where there
     was none."""
@@ -326,7 +326,7 @@ class Session:
         return not self.teleop.arrived or time.perf_counter() - self._woken < _REST / RATE
 
     def _latest(self) -> float:
-        """How late a step may be to be made up for [s]."""
+        """Return how late a step may be to be made up for [s]."""
         return max(_BEHIND, self.world.dt / self._speed)
 
     def _advance(self, due: float, began: float, *, at_once: bool) -> float:

@@ -108,6 +108,6 @@ SHAPES: Mapping[str, DrawnMesh] = MappingProxyType(
         "cap": _lathe(_arc(0.0, np.pi / 2, 8), 24),
     }
 )
-"""Of radius 1 around z. `tube` and `thin_tube`: open, from z = -1/2 to 1/2; `bar` and `disc`: the same,
-closed, `disc` with a slight bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the half of a
-ball above z = 0, open below."""
+"""Meshes of radius 1 around z. `tube` and `thin_tube`: open, from z = -1/2 to 1/2; `bar` and `disc`: the
+same, closed, `disc` with a slight bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the
+half of a ball above z = 0, open below."""

@@ -19,16 +19,16 @@ from fastrod_viewer.linked import TendonLimits
 from fastrod_viewer.world import ManualCommand, World
 
 LARGEST_BEND = math.pi / 2.0
-"""Of a segment toward either side [rad]."""
+"""Largest bend of a segment toward either side [rad]."""
 LARGEST_TENSION = 20.0
-"""Of a tendon that is driven by tension [N]."""
+"""Largest tension of a tendon that is driven by tension [N]."""
 DRAG_GAIN = 8.0
 """1/s: the tip is where it is dragged to within an eighth of a second."""
 FARTHEST = 0.25
-"""Of the robot's length: a tip that is dragged farther counts as this far."""
+"""Fraction of the robot's length: a tip that is dragged farther counts as this far."""
 DRAG_DAMPING = 0.02
-"""Of the robot's length by 1 rad: where less than that moves the tip, the motion is given up rather than the
-segments thrown about."""
+"""Fraction of the robot's length by 1 rad: where less than that moves the tip, the motion is given up
+rather than the segments thrown about."""
 JOINT_RATE = 0.4
 """Largest of a host's joint in a drag [rad/s]."""
 JOINT_COST = 25.0
@@ -42,11 +42,11 @@ class Speeds:
     """Largest rates, each positive. Raises `InputError`."""
 
     bend: float = math.pi
-    """Of a segment [rad/s]; tendons move no faster than this bend needs."""
+    """Speed of a segment's bend [rad/s]; tendons move no faster than this bend needs."""
     extension: float = 0.5
-    """Of a segment, in its own range a second [1/s]."""
+    """Speed of a segment's extension, in its own range a second [1/s]."""
     base: float = 0.2
-    """Of a base [m/s], and in rad/s five times that."""
+    """Speed of a base [m/s], and in rad/s five times that."""
 
     def __post_init__(self) -> None:
         for name in ("bend", "extension", "base"):
@@ -353,8 +353,8 @@ class Teleop:
         return rates[:n] if n else None
 
     def _drag_law(self, actions: SegmentActions, n_joints: int) -> ResolvedRate:
-        """Of the host's joints and the actions. A drag may pull anywhere: a robot at its limits follows
-        partly."""
+        """Drag law of the host's joints and the actions. A drag may pull anywhere: a robot at its limits
+        follows partly."""
         width = self._upper - self._lower
         cost = np.concatenate([np.full(n_joints, JOINT_COST), 1.0 / np.repeat(actions.offset, 3) ** 2])
         cost[n_joints::3] = 1.0 / np.maximum(width[::3], 1e-3) ** 2

@@ -89,7 +89,7 @@ class World(ABC):
     scripted: bool
     """It has a script."""
     duration: float
-    """Of the script [s]; the script begins again after it."""
+    """Duration of the script [s]; the script begins again after it."""
     host: bool
     """A rigid host carries the robot, and can be frozen."""
     base_moves: bool
@@ -97,7 +97,8 @@ class World(ABC):
     loads: bool
     """`ManualCommand.tip_force`, `payload` and `gravity` are heeded."""
     ringing: Ringing | None = None
-    """Of rods that have inertia: a drag is a spring on the tip, and they go on moving by themselves."""
+    """Ringing of rods that have inertia: a drag is a spring on the tip, and they go on moving by
+    themselves."""
 
     @property
     @abstractmethod

@@ -25,7 +25,7 @@ from fastrod_viewer.scene_graph import grid_places
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
 
 PERIOD = 6.0
-"""Of the motion that shows what a free robot can do [s]."""
+"""Period of the motion that shows what a free robot can do [s]."""
 SWAY = 1.6
 """Largest bend of a free robot in that motion, all segments together [rad]."""
 PUSH = 0.3
@@ -77,7 +77,7 @@ class SimulatedWorld(World):
 
     @abstractmethod
     def inputs(self, t: float) -> dict[str, Any]:
-        """Of the script at time t [s]: keyword arguments of `Simulator.step`."""
+        """Return the inputs of the script at time t [s]: keyword arguments of `Simulator.step`."""
 
     @property
     @final

@@ -85,8 +85,8 @@ def _pulls(dl: Floats, routing: Routing) -> Floats:
 
 
 def _neighbours(routing: Routing) -> tuple[list[int], list[int]]:
-    """Of each drive the next one of its segment counter-clockwise, and the one before; -1 where there is
-    none. Of two drives neither has one before, for it would be the next one again."""
+    """Return for each drive the next one of its segment counter-clockwise, and the one before; -1 where
+    there is none. Of two drives neither has one before, for it would be the next one again."""
     n = routing.n_drives
     following, before = [-1] * n, [-1] * n
     first = [int(np.flatnonzero(routing.drive == d)[0]) for d in range(n)]

@@ -1,1 +1,1 @@
-"""What no library has: learned from a residual, and kept apart."""
+"""Models learned from a residual that no library effect explains: learned from a residual, and kept apart."""

@@ -1,1 +1,1 @@
-"""What was measured: a log, prepared, beside the model that a vector of unknowns gives."""
+"""A measured log, prepared, beside the model that a vector of unknowns gives."""

@@ -27,7 +27,7 @@ def separating_run(one: str, other: str) -> str:
 
 
 def look_at(pattern: str) -> str:
-    """What to do about a pattern that no effect of the library makes."""
+    """Return what to do about a pattern that no effect of the library makes."""
     return f"look at the robot: {pattern}; fix it, or register an effect of your own for it, and run again"
 
 
@@ -60,8 +60,8 @@ def why_unknown(name: str, samples: LogSamples, robot: Robot) -> str:
 
 
 def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
-    """What this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2) commanded
-    [rad]."""
+    """Return what this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2)
+    commanded [rad]."""
     return [cannot for there, _, cannot in excitation(samples, bend) if not there]
 
 

@@ -110,7 +110,7 @@ class RestStretch:
 
 @dataclass(frozen=True, eq=False)
 class RestNoise:
-    """What is read from stretches at rest."""
+    """Noise read from stretches at rest."""
 
     model: AutoRegression
     sigma: Floats
@@ -247,8 +247,8 @@ class _Rest:
 
 
 def _slower(rest: _Rest, best: _Read) -> float:
-    """How much larger, relatively, the noise is where it is as slow as one standard error allows: stretches
-    that are short beside it hardly bound it."""
+    """Return how much larger, relatively, the noise is where it is as slow as one standard error allows:
+    stretches that are short beside it hardly bound it."""
     if not best.partial.size:
         return 0.0
     angle = 2.0 * np.pi * best.line * rest.time
@@ -285,7 +285,7 @@ def _broad(rest: _Rest, line: Floats | None) -> _Read:
 
 
 def _least(score: Callable[[Floats], float], simplex: Floats) -> Floats:
-    """Where a score is least, from a simplex (p + 1, p) on."""
+    """Return where a score is least, from a simplex (p + 1, p) on."""
     found = minimize(
         score,
         simplex[0],

@@ -201,8 +201,8 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
 
 
 def _of_session(robot: Robot, wiring: Routing, sensor: Mapping[str, Any]) -> list[Unknown]:
-    """What another session has of its own: zeros of the drives, registration and delay, about what the robot
-    file says."""
+    """Return what another session has of its own: zeros of the drives, registration and delay, about what
+    the robot file says."""
     zero = float(
         robot.fit.get("tendon.*.zero", {}).get("sd", _ZERO_SD * float(np.mean(wiring.tendon_offset)))
     )

@@ -29,14 +29,14 @@ _FAR = 0.02  # rad: tendons that stand further from where the file says are wort
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogCheck:
-    """What a first look at a log says."""
+    """Report of a first look at a log."""
 
     facts: Mapping[str, str]
-    """What the log holds: rows, drives, bends, tip, and how far the model follows it."""
+    """Facts about the log: rows, drives, bends, tip, and how far the model follows it."""
     refusal: str
     """Why nothing can be identified from it, in a sentence; empty where it can."""
     questions: tuple[str, ...]
-    """What else to ask the user, a sentence each."""
+    """Further questions to the user, a sentence each."""
     shows: tuple[str, ...]
     """Which effects the log can tell apart."""
     lacks: tuple[str, ...]

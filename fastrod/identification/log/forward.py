@@ -62,7 +62,7 @@ MODES = Modes(4, 2)  # of rods that need modes, as far off
 
 
 class PredictedPose(NamedTuple):
-    """What the rod does at each row, base frame, before the camera."""
+    """Pose of the rod at each row, base frame, before the camera."""
 
     position: Floats
     """(n, 3) tip [m]."""
@@ -174,7 +174,7 @@ def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
 
 
 class RodAnswer(NamedTuple):
-    """What a rod does besides its pose, for the effects that go by it."""
+    """Answer of a rod besides its pose, for the effects that depend on it."""
 
     tension: Floats
     """(n, n_tendons) 0 where no tendon stretches [N]."""
@@ -205,7 +205,8 @@ class PredictedRod:
         # a step of first order goes by the tendons that are slack before it, and is wrong where others are
         self._one_sided = any(tendon.unilateral for tendon in robot.tendons) and not robot.by_tension
         self.fine = _FINE if self._one_sided else 1.0
-        """Of the usual steps of slopes: a tendon that goes slack or taut within one bends it."""
+        """Steps relative to the usual ones of slopes: a tendon that goes slack or taut within one bends
+        it."""
         self._tolerance = self.fine * TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
         self.answer = RodAnswer(np.zeros((n, robot.n_tendons)), np.zeros((n, robot.n_segments, 2)))
@@ -247,7 +248,7 @@ class PredictedRod:
         return self._sim.solver == "modal"
 
     def keep(self) -> object:
-        """What `back` needs to return to the boundary of the last solve."""
+        """Return what `back` needs to return to the boundary of the last solve."""
         return self._sim.snapshot()
 
     def back(self, kept: object) -> None:
@@ -263,7 +264,7 @@ class PreparedLog:
     wiring: Routing
     samples: LogSamples
     ports: Ports
-    """Of the rows."""
+    """Ports of the rows."""
     params: Params
     reader: Reader
     dl: Floats
@@ -424,7 +425,7 @@ class PreparedLog:
         return opened, pose, answer
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
-        """What the kernel reads."""
+        """Return what the kernel reads."""
         ports, params, points = close_ports(opened, self.ports, self.params)
         return self.reader.with_point_forces(ports, Inputs(), points)[0] if points else ports, params
 
@@ -492,8 +493,8 @@ def predict(
     like: PreparedLog | None = None,
     rough: bool = False,
 ) -> PredictedPose:
-    """What the camera sees at the rows of `samples`, solved exactly, or `rough` (`PreparedLog.solve`); from a
-    solution nearby where one is given."""
+    """Return what the camera sees at the rows of `samples`, solved exactly, or `rough`
+    (`PreparedLog.solve`); from a solution nearby where one is given."""
     robot = model.robot_at(theta)
     place = prepare_log(samples, robot, model.wiring, like)
     links = effects_at(model, theta)

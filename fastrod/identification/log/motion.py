@@ -37,7 +37,7 @@ _STIFF = 0.02  # of the softest direction: along others nothing holds a tip
 
 @dataclass(frozen=True, eq=False)
 class MotionReplay:
-    """What rods do in motion when they are driven as `samples` says, at its rows."""
+    """Motion of rods that are driven as `samples` says, at its rows."""
 
     samples: LogSamples
     points: bool = False
@@ -49,8 +49,8 @@ class MotionReplay:
     def poses(
         self, robots: Sequence[Sequence[Robot]], progress: Callable[[int, int], None] | None = None
     ) -> list[PredictedPose]:
-        """What the camera sees of each of these robots, effects and all; each is given as it is in every
-        session, or once. They must differ in numbers only.
+        """Return what the camera sees of each of these robots, effects and all; each is given as it is in
+        every session, or once. They must differ in numbers only.
 
         `ok` is False from where the rod is lost to the end of its run. Raises `InputError` for a robot
         without mass, `LogError` for a payload that changes within a run.
@@ -104,7 +104,7 @@ class MotionReplay:
         return [s for s in self.samples.runs if ((rows >= s.start) & (rows < s.stop)).any()]
 
     def _pose(self, clock: _Clock, runs: list[slice], record: Floats, alive: Flags) -> PredictedPose:
-        """Of one robot, at the rows."""
+        """Return the pose of one robot at the rows."""
         rows = self.samples.rows
         found = np.full((len(rows), record.shape[2]), np.nan)
         ok = np.zeros(len(rows), bool)

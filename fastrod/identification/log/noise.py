@@ -1,5 +1,4 @@
-"""What of a measurement is noise: the camera at rest, and the samples that are outliers whatever the
-model."""
+"""Noise of a measurement: the camera at rest, and the samples that are outliers whatever the model."""
 
 from __future__ import annotations
 
@@ -36,13 +35,13 @@ class Noise:
     lag1: float
     """Autocorrelation from one sample to the next."""
     how: str
-    """What it was read from."""
+    """Source of this estimate."""
     model: AutoRegression = WHITE
-    """How samples know of each other."""
+    """Correlation of the samples."""
     uncertainty: float = 0.0
     """Relative standard error of `floor`; 0: not known."""
     period: float = 1.0
-    """From one sample to the next [s]."""
+    """Time from one sample to the next [s]."""
     sway: float = float("nan")
     """A line in the spectrum at rest [Hz], which is no noise; nan: none."""
 

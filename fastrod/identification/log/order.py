@@ -36,7 +36,7 @@ class ColumnOrder:
     """(n_segments,) by which the tendons of each segment are rotated about the axis against the robot file,
     to match [rad]."""
     left: float
-    """What does not match, of the answers' size."""
+    """Mismatch that remains, relative to the answers' size."""
 
     def of(self, dl: Floats) -> Floats:
         """(n, n_tendons) columns of a log in the order and with the signs of the tendons."""

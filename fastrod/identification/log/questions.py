@@ -70,13 +70,13 @@ _DENSE = 0.1  # of the motion from row to row
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a first look says of a log."""
+    """Reading of a log at first look."""
 
     registration: CameraRegistration | None
-    """Of a camera that stands far from where the robot file says; None where it does not, or where nothing
-    would follow from it."""
+    """Registration of a camera that stands far from where the robot file says; None where it does not, or
+    where nothing would follow from it."""
     questions: tuple[str, ...]
-    """What to ask the user, a sentence each."""
+    """Questions to the user, a sentence each."""
     refusal: str
     """Why nothing can be identified, in a sentence; empty where it may."""
     guess: str
@@ -84,7 +84,7 @@ class Reading:
 
 
 def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple[str, ...]:
-    """What `log` makes one ask about its units, signs, order, frame and time; nothing where it fits
+    """Return what `log` makes one ask about its units, signs, order, frame and time; nothing where it fits
     `robot`."""
     if int(log.measured.sum()) < _LEAST:
         return ()
@@ -244,7 +244,7 @@ class _Look:
         self.as_it_is = self.centred = np.inf
         """Distance that the model leaves as it is, and with both motions about their middles [m]."""
         self.scale = np.nan
-        """How much of the predicted motion is measured."""
+        """Ratio of the measured motion to the predicted one."""
         self.frame = self.mirrored = CameraRegistration(rotation=np.eye(3), shift=np.zeros(3), left=np.inf)
         if self.solved:
             seen, made = self.tip[pose.ok], pose.position[pose.ok]

@@ -1,5 +1,5 @@
-"""Where the camera stands: the rigid motion that lays predicted points on measured ones, roughly, before
-anything is fitted."""
+"""Registration of the camera: the rigid motion that lays predicted points on measured ones, roughly,
+before anything is fitted."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class CameraRegistration:
 
     @property
     def angle(self) -> float:
-        """Of the rotation [rad]."""
+        """Angle of the rotation [rad]."""
         return float(Rotation.from_matrix(self.rotation).magnitude())
 
     @property
     def distance(self) -> float:
-        """Of the shift [m]."""
+        """Distance of the shift [m]."""
         return float(np.linalg.norm(self.shift))
 
     def is_large(self, length: float) -> bool:
@@ -83,7 +83,7 @@ def frame_of(robot: Robot) -> CameraRegistration:
 
 
 def between(file: Robot, found: Robot) -> CameraRegistration:
-    """Where the camera of `found` stands from where `file` says."""
+    """Return where the camera of `found` stands from where `file` says."""
     one, two = frame_of(file), frame_of(found)
     rotation = two.rotation @ one.rotation.T
     return CameraRegistration(rotation=rotation, shift=two.shift - rotation @ one.shift, left=float("nan"))

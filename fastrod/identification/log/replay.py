@@ -40,7 +40,7 @@ class Replay:
     dynamics: bool = False
     """In motion, and not at rest in each row."""
     questions: tuple[str, ...] = ()
-    """What the log makes one ask about its units, signs, order, frame and time, a sentence each."""
+    """Questions that the log raises about its units, signs, order, frame and time, a sentence each."""
 
     @property
     def compared(self) -> Flags:
@@ -74,14 +74,14 @@ class Replay:
 
     @property
     def excursion_rms(self) -> float:
-        """How far the measured tip moves: its distance from its own mean, root mean square [m]."""
+        """Return how far the measured tip moves: its distance from its own mean, root mean square [m]."""
         tip = self.log.tip_position[self.compared]
         return _rms(tip - tip.mean(axis=0))
 
     @property
     def baseline_rms(self) -> float:
-        """What no model at all leaves: the measured tip's distance from the straight robot's tip, root mean
-        square [m]."""
+        """Return what no model at all leaves: the measured tip's distance from the straight robot's tip,
+        root mean square [m]."""
         return _rms(self.log.tip_position[self.compared] - (0.0, 0.0, self.robot.length))
 
     @property

@@ -1,4 +1,4 @@
-"""What a replay shows: a table of residuals, its rows as a file, and a figure."""
+"""Output of a replay: a table of residuals, its rows as a file, and a figure."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
 
 
 def _spread(axes: Axes, shown: Replay) -> None:
-    """How many rows have which residual distance [mm]."""
+    """Draw how many rows have which residual distance [mm]."""
     norm = _norm(shown)
     axes.hist(
         norm[np.isfinite(norm)], bins=40, range=(0.0, 1e3 * shown.max or 1.0), color=_RESIDUAL, alpha=0.8

@@ -33,9 +33,10 @@ class SplitLog:
     tested: Flags
     """(n,) samples that no fit sees."""
     labels: Sequence[str]
-    """What these are, in words."""
+    """Names of these rows, in words."""
     drives: Sequence[str] = ()
-    """What its drives did of their commands, where they were measured, in sentences."""
+    """Differences between the drives' positions and their commands, where they were measured, in
+    sentences."""
     swings: SplitLog | None = None
     """The same of runs that were let go from where they turn back, for a fit in motion; None where none was,
     or where the robot has no mass."""

@@ -1,5 +1,5 @@
-"""What is not known: parameters of the robot and of effects, each with a prior; and the model that a vector
-of them makes."""
+"""The unknowns: parameters of the robot and of effects, each with a prior; and the model that a vector of
+them makes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Unknown:
     """`segment.1.length`, `tendon.*.gain`, or `backlash.half_width`."""
     unit: str
     start: float
-    """Where a fit begins; of the robot's own parameters, the nominal value and the mean of the prior."""
+    """Start of a fit; of the robot's own parameters, the nominal value and the mean of the prior."""
     mean: float
     sd: float
     """Prior, in the unit; of `log` ones, of the logarithm."""
@@ -347,8 +347,8 @@ def _wrapped(angle: float) -> float:
 
 
 def _whole(robot: Robot, nominal: Robot) -> Robot:
-    """What a change of lengths and offsets must not lose: log points and body radii, moved where they would
-    not fit."""
+    """Return what a change of lengths and offsets must not lose: log points and body radii, moved where
+    they would not fit."""
     widest = [0.0] * robot.n_segments
     for tendon, end in zip(robot.tendons, robot.tendon_segment, strict=True):
         for k, place in enumerate(tendon.position(int(end) + 1)):

@@ -1,1 +1,1 @@
-"""What is said: verdict, figures, page, files."""
+"""Reports: verdict, figures, page, files."""

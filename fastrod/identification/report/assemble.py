@@ -1,5 +1,5 @@
-"""From the end of the search to a `Result`: predictions on every sample, errors, estimates, classes,
-verdict."""
+"""Assembly of a `Result` from the end of the search: predictions on every sample, errors, estimates,
+classes, verdict."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What was found, on every sample: fitted again to all training rows, of which the search saw a part."""
+    """The found effects on every sample: fitted again to all training rows, of which the search saw a
+    part."""
 
     search: Search
     start: ModelState
@@ -65,7 +66,7 @@ class Explained:
     state: ModelState
     """With those that were found."""
     names: tuple[str, ...]
-    """Of these, what moves the prediction most first."""
+    """Names of these effects, largest displacement first."""
     outlier: Flags
     used: Flags
     test: Flags
@@ -279,7 +280,7 @@ def _stand_ins(names: Sequence[str], state: ModelState) -> list[str]:
 
 
 def _of_sessions(state: ModelState) -> list[str]:
-    """How far each other session is from the first, in sentences."""
+    """Return how far each other session is from the first, in sentences."""
     model, said, first = state.model, [], frame_of(state.model.identified(state.theta))
     for k, label in enumerate(model.sessions[1:], 1):
         here, now = model.identified(state.theta, k), model.values(state.theta, k)
@@ -301,7 +302,7 @@ def _of_sessions(state: ModelState) -> list[str]:
 
 
 def _left_out(explained: Explained, error: Error) -> list[str]:
-    """How many rows jump beside what was found, and what they do to the held-out error."""
+    """Return how many rows jump beside what was found, and what they do to the held-out error."""
     n, every = int(explained.outlier.sum()), int(explained.search.samples.log.measured.sum())
     said = [f"{n} of {every} rows are outliers of what is left and do not count"] * (n > _MANY * every)
     if error.all_rows > _DIFFERS * error.after:
@@ -335,8 +336,8 @@ def _square(state: ModelState) -> float:
 
 
 def _own(state: ModelState, name: str) -> float:
-    """How far an effect by itself moves the prediction: squares over the samples, the other parameters as
-    they are."""
+    """Return how far an effect by itself moves the prediction: squares over the samples, the other
+    parameters as they are."""
     theta = state.theta.copy()
     for j, unknown in enumerate(state.model.unknowns):
         if unknown.place[:2] == ("effect", name) and not unknown.shape:
@@ -598,8 +599,8 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
 
 
 def limits(robot: Robot, samples: LogSamples) -> list[str]:
-    """What to try where this robot is thick or slow enough for shear or inertia and its file leaves them
-    out."""
+    """Return what to try where this robot is thick or slow enough for shear or inertia and its file leaves
+    them out."""
     found = []
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
     sheared = any(math.isfinite(s.shear_stiffness) for s in robot.segments)

@@ -186,7 +186,7 @@ def against_signal(view: SignalView, result: Result, name: str, alone: Sequence[
 
 
 def autocorrelation(result: Result, signals: Signals) -> str:
-    """How alike a residual is to itself some time later; a perfect model leaves only the band."""
+    """Return how alike a residual is to itself some time later; a perfect model leaves only the band."""
     steps = np.diff(result.log.t)
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     lags = np.unique(
@@ -259,7 +259,7 @@ def added(result: Result) -> str:
 
 
 def left_over_time(result: Result, signals: Signals) -> str:
-    """What is left of each axis, mean over stretches of time."""
+    """Return what is left of each axis, mean over stretches of time."""
     time, breaks = _timeline(result)
     at, colour = time[signals.rows], AFTER if result.effects else BEFORE
     edges = np.linspace(at.min(), at.max(), _PIECES + 1)
@@ -366,7 +366,7 @@ def _halves(figure: Figure, ratios: tuple[float, float]) -> tuple[Any, Any]:
 
 
 def _alone(axes: Axes, alone: Sequence[Signature]) -> None:
-    """What effects do by themselves to the tip, the one that was named first."""
+    """Draw what effects do by themselves to the tip, the one that was named first."""
     inks = zip(alone, (AFTER, *_RIVALS), ("-", "--", "-.", ":"), strict=False)
     for one, colour, dashes in inks:
         axes.plot(one.signal, 1e3 * one.shift, color=colour, ls=dashes, label=words(one.name))

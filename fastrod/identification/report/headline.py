@@ -142,7 +142,7 @@ def _bars(result: Result) -> str:
 
 
 def _found(result: Result) -> str:
-    """What was missing, with its numbers; where nothing was named, what would have shown."""
+    """Return what was missing, with its numbers; where nothing was named, what would have shown."""
     if result.effects:
         cards = []
         for found in result.effects:

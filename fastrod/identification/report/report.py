@@ -1,4 +1,4 @@
-"""What `identify` found, for machines, for the browser and for the terminal: report.json, report.html,
+"""Report of `identify`, for machines, for the browser and for the terminal: report.json, report.html,
 identified.toml, a table."""
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def _error(error: Error) -> dict[str, float]:
 
 
 def _registration(camera: CameraRegistration | None) -> dict[str, Any] | None:
-    """Where a camera stands that was far from where the robot file says; None where it was not."""
+    """Return where a camera stands that was far from where the robot file says; None where it was not."""
     if camera is None:
         return None
     return {

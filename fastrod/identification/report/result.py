@@ -1,4 +1,4 @@
-"""What identification found, as data: every table and figure of the report is drawn from a `Result`."""
+"""Result of an identification, as data: every table and figure of the report is drawn from a `Result`."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Found:
     drive: int | None = None
     """The one drive that has it, from 1 on; None where it is not one drive's."""
     signatures: Sequence[Signature] = ()
-    """What it does by itself, then what the effects do that it cannot be distinguished from; empty without
-    tendons."""
+    """Signatures: of the effect by itself, then of the effects that it cannot be distinguished from; empty
+    without tendons."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class SearchStage:
     """One point of the path from before to after."""
 
     name: str
-    """Of the effect that was added; `base` for the first."""
+    """Name of the effect that was added; `base` for the first."""
     train: float
     held_out: float
     """Distance rms [m]."""
@@ -99,7 +99,7 @@ class Result:
     identified: Robot
     """With the fitted parameters and the found effects."""
     held_out: Sequence[str]
-    """What was held out, in words."""
+    """Description of the held-out rows."""
     noise: Noise
     measured: Flags
     """(n,) samples with a measured tip."""
@@ -126,27 +126,27 @@ class Result:
     remaining_kind: str
     """none | static | memory | drift | unknown."""
     remaining_fraction: float
-    """Of the mean square error above the noise that the base model left."""
+    """Fraction that remains of the mean square error above the noise that the base model left."""
     patterns: Sequence[str]
-    """What the remaining structure looks like, where a pattern outside the library fits it."""
+    """Patterns of the remaining structure, where a pattern outside the library fits it."""
     tried: Sequence[Tried]
     path: Sequence[SearchStage]
     bounds: Sequence[Bound]
     advice: Sequence[str]
     notes: Sequence[str]
-    """What is odd about this log."""
+    """Remarks on what is unusual in this log."""
     solves: int
     """Batches of the rod that the search took."""
     registration: CameraRegistration | None = None
-    """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
+    """Pose of the camera relative to the robot file, fitted; None where it stood near enough for the
     search."""
     clock: Estimate | None = None
     """Time by which commands stand later in the log than they acted [s]; None where both have one clock."""
     sessions: Mapping[str, Robot] = field(default_factory=dict)
     """The identified robot in each other session, by its label."""
     as_given_rms: tuple[float, float] | None = None
-    """Of the robot as it was given, on fitted and on held-out samples [m]; None where it was not asked
-    for."""
+    """Error of the robot as it was given, rms on fitted and on held-out samples [m]; None where it was not
+    asked for."""
     revisits: tuple[Revisits, Revisits] | None = None
     """The same command at other times, before and after; None where too few come again."""
     network: Mapping[str, float] = field(default_factory=dict)

@@ -1,5 +1,5 @@
-"""What a residual is drawn against: for each effect the signal that its seam suggests, and the direction in
-which it shows most."""
+"""Signals against which a residual is drawn: for each effect the signal that its seam suggests, and the
+direction in which it shows most."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class Signals:
         return self._best(signals, [*self._axes(), *self._radial()])
 
     def _behind(self, time_constant: float) -> SignalView:
-        """How far the bend is from where it was over the last while."""
+        """Return how far the bend is from where it was over the last while."""
         step = np.diff(self.time, prepend=self.time[:1])
         signals, components = [], []
         for k in range(self.bend.shape[1]):

@@ -1,4 +1,5 @@
-"""What an effect does by itself: how far it moves the tip while one bend swings to and fro, less and less."""
+"""Signature of an effect by itself: how far it moves the tip while one bend swings to and fro, less and
+less."""
 
 from __future__ import annotations
 

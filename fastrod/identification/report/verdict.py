@@ -1,4 +1,4 @@
-"""From errors and patterns to a verdict, in words that say no more than the log shows."""
+"""Verdict from errors and patterns, in words that say no more than the log shows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
 
 CLEAN = 0.06
-"""Of the residual's variance: structure below it is none."""
+"""Largest fraction of the residual's variance: structure below it is none."""
 # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
 _EXPLAINED, _PARTLY = 0.03, 0.45
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
@@ -160,8 +160,8 @@ def _listed(found: Sequence[str]) -> str:
 def _cut(
     found: Sequence[str], held_out: tuple[float, float], base: float, library: float, floor: float
 ) -> str:
-    """What adding effects does to the error, in millimetres; to that of the training data where nothing was
-    held out."""
+    """Return what adding effects does to the error, in millimetres; to that of the training data where
+    nothing was held out."""
     known = all(map(np.isfinite, held_out))
     before, after = held_out if known else (float(np.sqrt(base)), float(np.sqrt(library)))
     which = "held-out" if known else "training"

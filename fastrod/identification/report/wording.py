@@ -51,7 +51,7 @@ _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
 
 
 BASE_MODELS: dict[str, type] = {ONE_SIDED: OneSidedTendons, INERTIA: RodInertia, DAMPING: KelvinVoigtDamping}
-"""What a base model may lack besides effects, by name."""
+"""Base models that lack more than effects, by name."""
 
 
 def friendly(unit: str, size: float) -> tuple[float, str]:
@@ -143,7 +143,7 @@ def law(name: str) -> dict[str, str]:
 
 
 def bound_sentence(bound: Bound) -> str:
-    """From which size on an effect would have shown."""
+    """Return the sentence on the smallest size at which an effect would have shown."""
     stem = re.sub(r"_([xyz]|\d+)$", "", bound.parameter)
     noun = _NOUNS.get(
         stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem)

@@ -1,1 +1,1 @@
-"""What fits: base parameters, candidates, and which of them the held-out blocks confirm."""
+"""Fits: base parameters, candidates, and which of them the held-out blocks confirm."""

@@ -1,4 +1,5 @@
-"""What no effect of the library is: patterns that a residual may have for reasons outside the model.
+"""Patterns that no effect of the library makes: patterns that a residual may have for reasons outside the
+model.
 
 Each alternative pattern is a few linear columns, some of them found by a scan. They compete with the effects
 on the same terms; where one wins, the verdict is that the cause is not in the library, and of which kind it
@@ -39,7 +40,7 @@ class AlternativePattern:
     n_hidden: int
     """Parameters that a scan has chosen, beside the k amplitudes."""
     start: Mapping[str, float] | None = None
-    """Where the fit of the effect of the same name begins; None where none stands for it in this log."""
+    """Start of the fit of the effect of the same name; None where none stands for it in this log."""
     drive: int | None = None
     """The one drive that has the effect, from 0 on."""
     n_tried: int = 1

@@ -22,7 +22,7 @@ from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
 
 SEEN = 0.7
-"""Of the prior's sd: a parameter whose data say less is not identifiable."""
+"""Fraction of the prior's sd: a parameter whose data say less is not identifiable."""
 _FOR_NOISE = 20000  # samples
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
@@ -37,10 +37,10 @@ class Rival:
     left: float
     """Distance rms that it leaves on held-out blocks [m]."""
     z: float
-    """Of what it gains on them."""
+    """z of what it gains on them."""
     bic_gain: float
     fraction: float
-    """Of the loss of the base model as it was given that it takes away."""
+    """Fraction of the loss of the base model as it was given that it takes away."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class BaseFit:
     """The base model, fitted to what the search looks at: what every candidate stands beside."""
 
     robot: Robot
-    """As it was given."""
+    """The robot as it was given."""
     search: Search
     """Its samples, with the weights of this fit."""
     noise: Noise

@@ -51,8 +51,8 @@ def correlated(columns: Floats, correlation: Floats) -> Floats:
 
 
 def spread(columns: Floats, correlation: Floats) -> float:
-    """How much more variance correlated rows leave along columns (n, n_out, k) than independent ones would:
-    the mean over the directions that the columns span; 1 for white rows, never less."""
+    """Return how much more variance correlated rows leave along columns (n, n_out, k) than independent
+    ones would: the mean over the directions that the columns span; 1 for white rows, never less."""
     if len(correlation) < 2 or not columns.shape[-1]:
         return 1.0
     flat = columns.reshape(-1, columns.shape[-1])
@@ -71,7 +71,8 @@ def length(correlation: Floats) -> float:
 
 
 def blocks_alike(correlation: Floats, rows: int) -> float:
-    """How much too large z over blocks of so many rows is, as each knows of the next; 1 for white rows."""
+    """Return how much too large z over blocks of so many rows is, as each knows of the next; 1 for white
+    rows."""
     if len(correlation) < 2 or rows < 1:
         return 1.0
 

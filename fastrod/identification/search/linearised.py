@@ -42,7 +42,7 @@ _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
-    """What was measured at the rows, and how much each number counts."""
+    """Measurement at the rows, and how much each number counts."""
 
     tip: Floats
     """(n, 3) [m]."""
@@ -327,8 +327,8 @@ class LinearisedModel:
         return np.asarray(change + np.einsum("nij,nj->ni", by_force, force - self._feedback))
 
     def seen(self, model: Model, theta: Floats, change: Floats) -> PredictedPose:
-        """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
-        points [m], base frame."""
+        """Return what the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation
+        vector [rad], points [m], base frame."""
         rotation = self.pose.rotation
         sensing = [each for each in effects_at(model, theta) if each.effect.seam is Seam.SENSING]
         if sensing or self.target.rotation is not None:

@@ -1,4 +1,4 @@
-"""What speaks for a candidate: the states that the search compares, and the rules by which one is taken, a
+"""Evidence for a candidate: the states that the search compares, and the rules by which one is taken, a
 rival, or needless."""
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ModelState:
     model: Model
     linearised: LinearisedModel
     fit: Fit
-    """Of the unknowns, then of the accepted alternative patterns' amplitudes."""
+    """Fit of the unknowns, then of the accepted alternative patterns' amplitudes."""
     losses: Floats
     """(N_BLOCKS,) held out."""
     alternatives: tuple[AlternativePattern, ...] = ()
@@ -71,10 +71,10 @@ class Candidate:
     state: ModelState | None
     """With the candidate accepted; None where it was not fitted."""
     z: float
-    """Of the gain over held-out blocks."""
+    """z of the gain over held-out blocks."""
     bic_gain: float
     fraction: float
-    """Of the loss that it takes away."""
+    """Fraction of the loss that it takes away."""
     n_parameters: int
     why: str
     """Why it is not the one, in a sentence."""
@@ -147,8 +147,8 @@ def equally_wrong(before: float, best: float, other: float, noise: float) -> boo
 
 
 def from_sub_law(state: ModelState, name: str, where: Mapping[str, str | float]) -> float:
-    """How far the estimate of an effect lies from a law that it contains (`Law.nests`), in standard errors;
-    of several parameters the furthest."""
+    """Return how far the estimate of an effect lies from a law that it contains (`Law.nests`), in standard
+    errors; of several parameters the furthest."""
     theta, spread = state.theta, covariance(state.fit)
     labels = [u.name.removeprefix(f"{name}.") for u in state.model.unknowns]
 

@@ -34,13 +34,13 @@ from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
 _STEP = 0.02
-"""Of an unknown's typical size, for differences: a thousandth of the value for most. Below it the tolerance
-of a step's Newton method would show, 1e-6 of the bend."""
+"""Step as a fraction of an unknown's typical size, for differences: a thousandth of the value for most.
+Below it the tolerance of a step's Newton method would show, 1e-6 of the bend."""
 HORIZONS = (0.06, 0.12, 0.25, 0.5, 1.0, 1.0)
 """Fractions of each run that are fitted one after the other: an oscillation that is off by half a period at
 the end of a run pulls its frequency to a neighbour."""
 INERTIA, DAMPING = "inertia", "damping"
-"""What a model at rest lacks where a robot rings."""
+"""Effects that a model at rest lacks where a robot rings."""
 _FIRST = 0.56  # sqrt(EI / (m l^3)) of a rod that is clamped at one end: its first frequency [Hz]
 _FADES = 0.1  # of a radian of its first oscillation: damping time where the file has none
 _WIDE = 1.5  # relative sd of it
@@ -55,7 +55,7 @@ _QUICK = 2.0  # times the step of the fit, with which candidates are tried befor
 
 @dataclass(eq=False)
 class MotionRod:
-    """What rods do in motion at the rows of `samples`, each robot once."""
+    """Rods in motion at the rows of `samples`, each robot once."""
 
     samples: LogSamples
     points: bool = False
@@ -69,7 +69,7 @@ class MotionRod:
     _known: dict[str, PredictedPose] = field(default_factory=dict)
 
     def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
-        """What the camera sees of each of these robots, as it is in every session."""
+        """Return what the camera sees of each of these robots, as it is in every session."""
         new = {repr(each): each for each in robots if repr(each) not in self._known}
         for keys, batch in _batches(new):
             replay = MotionReplay(
@@ -152,7 +152,7 @@ class MotionModel:
 
     @cached_property
     def pose(self) -> PredictedPose:
-        """What the camera sees."""
+        """Return what the camera sees."""
         return self.rod.poses([self.model.in_sessions(self.theta)])[0]
 
     def under(self, target: Target) -> MotionModel:
@@ -216,7 +216,7 @@ class MotionSearch(Search):
     in_motion: ClassVar[bool] = True
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
-        """What the camera sees at the rows of `samples`."""
+        """Return what the camera sees at the rows of `samples`."""
         return MotionRod(samples, self.rod.points, self.rod.threads).poses([model.in_sessions(theta)])[0]
 
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
@@ -292,8 +292,8 @@ class MotionSearch(Search):
 
 
 def _starts(state: ModelState, model: Model, name: str) -> list[Floats]:
-    """Where fits begin: as at rest, and at shorter times, for a rod that rings has minima half a period
-    apart."""
+    """Return where fits begin: as at rest, and at shorter times, for a rod that rings has minima half a
+    period apart."""
     every, n = starts_of(state, model, name), len(state.model.unknowns)
     timed = [j for j, u in enumerate(model.unknowns) if j >= n and u.unit == "s"]
     for start in every[:] if timed else []:
@@ -401,7 +401,7 @@ def _weighed(target: Target, noise: Noise, left: Floats) -> Target:
 
 
 def _noise(samples: LogSamples, robot: Robot, left: Floats) -> Noise:
-    """Of the fast part of a residual (n, 3) [m]: inputs that rest are no rest of a rod that rings."""
+    """Noise of the fast part of a residual (n, 3) [m]: inputs that rest are no rest of a rod that rings."""
     found = read_noise(samples, left, left)
     given = robot.sensor.get("noise", 0.0)
     declared = float(max(given) if isinstance(given, tuple) else given)

@@ -1,5 +1,5 @@
-"""What of a residual follows from anything that is known: inputs now, inputs before, or time; without naming
-a cause.
+"""Test of whether a residual depends on anything that is known: inputs now, inputs before, or time; without
+naming a cause.
 
 Ridge regression on general features, judged on blocks that it has not seen. The shares are increments: static
 features first, then those with memory, then time. What follows from none of them and is still not noise is a
@@ -40,7 +40,7 @@ class ResidualStructure:
     exogenous: float
     """Autocorrelation that no input, memory or time explains, as a share of the variance."""
     z: float
-    """How sure it is that there is any structure, over blocks."""
+    """Significance of any structure, over blocks."""
 
     def with_memory(self, again: Revisits | None) -> ResidualStructure:
         """The same, with what visits of one command say is memory: from outside comes the less."""
@@ -148,8 +148,8 @@ def faster_than_commands(samples: LogSamples, residual: Floats) -> tuple[float, 
 
 
 class _Null:
-    """What general features find in noise that is alike from row to row: slow noise follows slow features
-    from one block to the next."""
+    """Distribution of the score of general features on noise that is alike from row to row: slow noise
+    follows slow features from one block to the next."""
 
     def __init__(self, correlation: Floats, n_out: int, block: Ints, n_blocks: int) -> None:
         drawn = draws(correlation, len(block), n_out * _DRAWS)

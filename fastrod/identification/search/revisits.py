@@ -43,7 +43,7 @@ class Revisits:
 
     @property
     def floor(self) -> float:
-        """What models without memory leave at these commands at best, rms [m]."""
+        """Return what models without memory leave at these commands at best, rms [m]."""
         return self.elsewhere / math.sqrt(2.0)
 
     def sentence(self) -> str:
@@ -76,7 +76,8 @@ class Visits:
     """(n,)"""
 
     def compare(self, tip: Floats) -> Revisits | None:
-        """What a predicted tip (n_samples, 3) [m] leaves at these visits; None where they are too few."""
+        """Return what a predicted tip (n_samples, 3) [m] leaves at these visits; None where they are too
+        few."""
         residual = self.measured - tip
         mean = np.array([np.nanmean(residual[rows], axis=0) for rows in self.rows]).reshape(-1, 3)
         one, other = mean[self.pairs.T]

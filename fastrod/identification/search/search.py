@@ -62,7 +62,8 @@ from fastrod.types import Floats, Ints
 
 N_BLOCKS = 20
 MOST_PASSES = 4000.0
-"""Of each row, on the average, after which nothing new is tried. A log with two effects took 390."""
+"""Iterations of each row, on the average, after which nothing new is tried. A log with two effects took
+390."""
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _STIFF = 0.01  # of a segment's own stiffness, over that of a tendon
@@ -95,7 +96,7 @@ class Search:
     in_motion: ClassVar[bool] = False
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
-        """What the camera sees at the rows of `samples`, solved exactly."""
+        """Return what the camera sees at the rows of `samples`, solved exactly."""
         return predict(model, theta, samples, PredictedRod(samples, model.robot, threads=self.rod.threads))
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
@@ -675,7 +676,7 @@ def _yields(robot: Robot) -> bool:
 
 
 def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
-    """Where fits of `model` begin, which has an effect more than `state`: its parameters' starts."""
+    """Return where fits of `model` begin, which has an effect more than `state`: its parameters' starts."""
     added = model.unknowns[len(state.model.unknowns) :]
     starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
     # per-segment and per-drive columns share their parameter's starts
@@ -720,7 +721,7 @@ def _clearly_better(one: Candidate, other: Candidate) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchOutcome:
-    """What a search found in the residual of the base model."""
+    """Outcome of a search in the residual of the base model."""
 
     search: Search
     """With the weights of the last fit."""
@@ -731,6 +732,6 @@ class SearchOutcome:
     state: ModelState
     """With the effects alone."""
     names: tuple[str, ...]
-    """Of these effects."""
+    """Names of these effects."""
     steps: tuple[SearchStep, ...]
     notes: tuple[str, ...] = ()

@@ -40,7 +40,7 @@ class Estimate:
     prior_mean: float = float("nan")
     """nan: none, or not said."""
     prior_distance: float = 0.0
-    """From the prior's mean, in its sd; of what is fitted as a logarithm, that of the logarithms."""
+    """Distance from the prior's mean, in its sd; of what is fitted as a logarithm, that of the logarithms."""
 
     @property
     def beyond_prior(self) -> bool:

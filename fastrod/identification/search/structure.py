@@ -191,7 +191,7 @@ def _places(robot: Robot) -> list[list[int]]:
 
 
 def _direction(tendon: Tendon) -> float:
-    """Where it lies at its end [rad]."""
+    """Return where it lies at its end [rad]."""
     return float(tendon.angle[-1] if isinstance(tendon.angle, tuple) else tendon.angle)
 
 

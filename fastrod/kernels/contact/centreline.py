@@ -51,7 +51,8 @@ def curve_slip(motion: ContactMotion, i: int) -> Curve:
 
 @inline
 def _weights(fraction: float, h: float) -> tuple[float, float, float, float]:
-    """Of the value at the start, the slope there, the value at the end and the slope there."""
+    """Return the weights of the value at the start, the slope there, the value at the end and the slope
+    there."""
     t, u = fraction, 1.0 - fraction
     return (1.0 + 2.0 * t) * u * u, h * t * u * u, t * t * (3.0 - 2.0 * t), -h * t * t * u
 

@@ -23,7 +23,7 @@ from ..jit import kernel
 from .bvh import FAR
 
 _ROUNDS = 40
-"""Of the active set: those that agree do so in a dozen, the others go to and fro."""
+"""Rounds of the active set: those that agree do so in a dozen, the others go to and fro."""
 _SWEEPS = 400
 _CHECK = 50
 """Rounds of Gauss-Seidel, and how often their rate of convergence is looked at."""

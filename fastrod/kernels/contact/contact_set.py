@@ -23,7 +23,7 @@ _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apar
 
 
 class ContactRules(NamedTuple):
-    """What the choice of one robot's contacts depends on, beside the contacts."""
+    """Parameters of one robot's choice of contacts, beside the contacts."""
 
     surfaces: Surfaces
     n_obstacles: int
@@ -56,7 +56,7 @@ def carries(contact: Record) -> bool:
 
 @inline
 def arm_of(contact: Record) -> Vec:
-    """From the centreline to where the force acts."""
+    """Return the arm from the centreline to where the force acts."""
     return scale(-contact.arm, normal_of(contact))
 
 
@@ -129,8 +129,8 @@ def _held_depth(k: int, s: float, count: int, contacts: Records, spacing: float)
 def violation(
     n_found: int, found: Records, count: int, contacts: Records, spacing: float, surfaces: Surfaces
 ) -> tuple[float, int]:
-    """How far the gap falls below what the present contacts can close [m], and the candidate where it falls
-    deepest. Only where an obstacle is compliant may a contact be deep."""
+    """Return how far the gap falls below what the present contacts can close [m], and the candidate where
+    it falls deepest. Only where an obstacle is compliant may a contact be deep."""
     worst, where = 0.0, -1
     for f in range(n_found):
         k = found[f].obstacle
@@ -155,7 +155,7 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
 
 @kernel
 def _segment_is_full(s: float, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """As many contacts on this segment as it has nodes inside to put them on."""
+    """Whether this segment has as many contacts as it has nodes inside to put them on."""
     k = segment_at(rules.arclength, rules.n_steps, s)
     members = 0
     for c in range(count):
@@ -183,8 +183,8 @@ def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
 def _least_wanted(
     s: float, gap: float, count: int, contacts: Records, rules: ContactRules, anywhere: bool
 ) -> int:
-    """Of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap, if it is wider
-    than `gap`; -1 if none is."""
+    """Least wanted of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap,
+    if it is wider than `gap`; -1 if none is."""
     k, widest, at = segment_at(rules.arclength, rules.n_steps, s), gap, -1
     for c in range(count):
         here = anywhere or segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k

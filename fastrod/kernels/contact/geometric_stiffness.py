@@ -20,8 +20,8 @@ from .problem import ContactWorld, node_position
 from .surface import surface_curvature
 
 _FORGETS, _FRACTION_KEPT = 0.5, 0.3
-"""Of a stiffness that damping was based on: what is left of it after one pass, and what damps where nothing
-is curved. (A contact that goes to and fro between an edge and a face comes to rest with these.)"""
+"""Decay of a stiffness that damping was based on: what is left of it after one pass, and what damps where
+nothing is curved. (A contact that goes to and fro between an edge and a face comes to rest with these.)"""
 _FLAT = 1e-3
 """Second derivative of the gap along a rod [1/m] below which its minimum is not followed, for it would run
 away along the rod; of two rods the determinant, over the squared curvature."""
@@ -125,9 +125,9 @@ def geometric_stiffness(
 
 @kernel
 def keep_damping(m: int, world: ContactWorld, problem: ContactProblem) -> None:
-    """Where no contact is curved any more, damp by a fraction of what was stiff some passes ago: a contact
-    that goes to and fro between an edge and a face would not come to rest, as the face by itself is not
-    damped. No contact that presses is damped less than by the bending stiffness of its rod, EI/l^3."""
+    """Damp by a fraction of what was stiff some iterations ago where no contact is curved any more: a
+    contact that goes to and fro between an edge and a face would not come to rest, as the face by itself
+    is not damped. No contact that presses is damped less than by the bending stiffness of its rod, EI/l^3."""
     most, kept, least, stiffness = 0.0, 0.0, 0.0, problem.stiffness
     for c in range(m):
         most = max(most, stiffness[c])

@@ -38,10 +38,10 @@ from .solve import solve_contacts
 from .tunnelling import face_entered_sides, moved_far, tunnelled
 
 GOES_ON, AT_REST, LOST, BACK = 0, 1, 2, 3
-"""Of a world after a pass; BACK: a damped iteration went through something, or found no forces, and is to go
-less far."""
+"""State of a world after an iteration; BACK: a damped iteration went through something, or found no
+forces, and is to go less far."""
 NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
-"""What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
+"""Causes that keep a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
 something, it went through something, its numbers are no numbers."""
 # of EI/l in the base moment, about radians of bend: farther the linear model does not hold
 _LONGEST_ROTATION = 0.5
@@ -55,7 +55,7 @@ _EVERYWHERE = 1.0  # a margin beyond the rod's length asks for the smallest gap,
 
 
 class ContactIteration(NamedTuple):
-    """What one iteration of a batch reads and writes."""
+    """Arrays that one iteration of a batch reads and writes."""
 
     rows: ContactRows
     rods: ContactRods
@@ -152,8 +152,8 @@ def _limit_step(r: int, world: ContactWorld, problem: ContactProblem) -> tuple[f
 
 @kernel
 def _indent(r: int, world: ContactWorld, proposed: Floats) -> float:
-    """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is
-    pressed along its axis nothing else moves."""
+    """Return how much farther the proposed forces go into soft obstacles, or move free ones [m]; where a
+    rod is pressed along its axis nothing else moves."""
     deepest, i, surfaces = 0.0, world.robot[r], world.surfaces
     for q in range(world.contacts.used[i]):
         k = world.contacts.contact[i, q].obstacle

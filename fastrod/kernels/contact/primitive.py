@@ -48,8 +48,8 @@ def ray_primitive(signed: int, size: Vec, p: Vec, direction: Vec, longest: float
 
 @kernel
 def _exit_length(signed: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
-    """From inside: the distance is convex along the ray, so it has one root there; by doubling, then
-    bisection."""
+    """Return the exit length of a ray from inside: the distance is convex along the ray, so it has one
+    root there; by doubling, then bisection."""
     low, high = 0.0, 1e-3
     while signed_at(signed, size, axpy(high, direction, p))[0] < 0.0:
         low, high = high, 2.0 * high

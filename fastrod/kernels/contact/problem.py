@@ -118,7 +118,7 @@ def task_problem(problem: ContactProblem, i: int) -> ContactProblem:
 
 @inline
 def rod_search(world: ContactWorld) -> RodSearch:
-    """What the search between rods needs of a world."""
+    """Return what the search between rods needs of a world."""
     return RodSearch(
         world.motion, world.rods, world.contacts, len(world.surfaces.primitive), world.motion.margin
     )
@@ -126,7 +126,7 @@ def rod_search(world: ContactWorld) -> RodSearch:
 
 @inline
 def node_position(world: ContactWorld, i: int, node: int) -> Vec:
-    """Of robot i, world [m]."""
+    """Return the position of a node of robot i, world [m]."""
     row = world.motion.position[i, node]
     return row[0], row[1], row[2]
 

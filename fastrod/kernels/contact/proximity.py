@@ -1,4 +1,4 @@
-"""Where one rod comes nearest to the obstacles: local minima of the signed distance along its centreline.
+"""Nearest points of a rod and the obstacles: local minima of the signed distance along its centreline.
 
 phi(s) is the signed distance of the centreline, with slope n . r'. It changes by at most 1 per metre, so that
 what was measured once rules out whole stretches, along the rod and over time (`Clearance`). Where phi may
@@ -39,7 +39,7 @@ _RELAY = 0.25
 
 
 class ProximityOptions(NamedTuple):
-    """How a search is to be done."""
+    """Options of a search."""
 
     radius: Floats
     """(n_segments,) of the rod [m]."""
@@ -111,7 +111,7 @@ def node_tangent(curve: Curve, j: int, start: int, fraction: float) -> Vec:
 
 @inline
 def radius_after(options: ProximityOptions, j: int) -> float:
-    """Of the interval after node j."""
+    """Return the radius of the interval after node j."""
     return float(options.radius[min(j // options.n_steps, len(options.radius) - 1)])
 
 
@@ -186,7 +186,7 @@ def _may_hide(f0: float, f1: float, length: float, curvature: float, level: floa
 
 @inline
 def _curvature(curve: Curve, j: int) -> float:
-    """Of the centreline at node j [1/m]."""
+    """Curvature of the centreline at node j [1/m]."""
     u = curve.curvature[j]
     return math.sqrt(u[0] * u[0] + u[1] * u[1])
 
@@ -271,7 +271,7 @@ def _search_nodes(
 
 @inline
 def _fraction_of_first(search: ProximitySearch, start: int) -> float:
-    """Of the interval after node `start`, where contact begins."""
+    """Return the fraction, of the interval after node `start`, at which contact begins."""
     s, first = search.curve.arclength, search.options.first
     return float(max(0.0, (first - s[start]) / (s[start + 1] - s[start])))
 

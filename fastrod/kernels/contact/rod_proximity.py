@@ -41,7 +41,7 @@ class Nearest(NamedTuple):
     """Arclength on the other [m]."""
     distance: float
     normal: Vec
-    """From the other to the first, world."""
+    """Normal from the other to the first, world."""
 
 
 @kernel
@@ -121,7 +121,7 @@ def _known(robot: int, other: int, near: Nearest, search: RodSearch) -> int:
 
 @inline
 def _radius_at(i: int, s: float, search: RodSearch) -> float:
-    """Of robot i at arclength s [m]."""
+    """Return the radius of robot i at arclength s [m]."""
     return float(search.rods.radius[i, segment_at(search.motion.arclength[i], search.rods.n_steps, s)])
 
 

@@ -165,7 +165,7 @@ def update_boundary(chunk: Chunk, batch: Batch, work: PassWorkspace, mode: Mode)
 
 @kernel
 def _keep_force_gain(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
-    """How x answers a tip force, beside the gain."""
+    """Keep the response of x to a tip force, beside the gain."""
     params, memory, n_x, n_e, n_col = batch.params, batch.memory, work.size.x, work.size.e, work.size.col
     for w in range(chunk.n_robots):
         i = chunk.robots[w]

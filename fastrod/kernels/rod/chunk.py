@@ -191,7 +191,7 @@ def add_base_moment(node: Lanes, wrench: Lanes, sign: float) -> None:
 
 @inline
 def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
-    """From base to tip: the rod, the tendons' lengths and the columns."""
+    """Integrate from base to tip: the rod, the tendons' lengths and the columns."""
     params, ports, layout, memory = batch
     rod, sens, n, loads = work.rod, work.sens, work.size.tendons, output.loads
     node, start = rod.node, rod.node[sh.N_K * W :]
@@ -238,7 +238,7 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode:
 
 @inline
 def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
-    """What lies beyond the last step: loads on the tip, and the cross-section there."""
+    """Add what lies beyond the last step: loads on the tip, and the cross-section there."""
     params, layout, rod = batch.params, batch.layout, work.rod
     n, n_segments, loads = work.size.tendons, params.length.shape[1], output.loads
     tip = n_segments * layout.n_steps

@@ -35,7 +35,7 @@ Axes: TypeAlias = tuple[float, float, float, float, float]
 
 
 class ColdWorkspace(NamedTuple):
-    """What is kept of one robot on the way; a segment's samples follow each other, SAMPLES + 1 of them."""
+    """Memory of one robot during a cold start; a segment's samples follow each other, SAMPLES + 1 of them."""
 
     free: Flags
     """(n_tendons,) the tension is unknown."""

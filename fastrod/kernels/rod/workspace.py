@@ -1,4 +1,4 @@
-"""What a pass is given by name: its robots, what it shall do, and the buffers that it works in."""
+"""Arguments of a pass by name: its robots, what it shall do, and the buffers that it works in."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Chunk(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What a pass writes; arrays of length 0 are not wanted."""
+    """Output of a pass; arrays of length 0 are not wanted."""
 
     shape: RodShape
     response: Response
@@ -42,7 +42,7 @@ class Output(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """What a pass does."""
+    """Mode of a pass."""
 
     n_col: int
     """Columns of sensitivities. Without columns the update is by the gain that the robot has."""
@@ -89,7 +89,7 @@ class Size(NamedTuple):
 
 
 class RodLanes(NamedTuple):
-    """Where the march stands (the offsets of `shape` name the fields)."""
+    """State of the march (the offsets of `shape` name the fields)."""
 
     node: Lanes
     stages: Lanes
@@ -98,7 +98,7 @@ class RodLanes(NamedTuple):
 
 
 class Sensitivities(NamedTuple):
-    """What marches along with the rod, for every column."""
+    """Sensitivities that are integrated along with the rod, for every column."""
 
     n_x: int
     """Columns of unknowns; those of loads follow."""

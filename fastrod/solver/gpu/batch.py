@@ -1,4 +1,4 @@
-"""What is launched on a GPU: a thread takes one robot after the other, with the scratch of a pass in its
+"""Launch of passes on a GPU: a thread takes one robot after the other, with the scratch of a pass in its
 local memory.
 
 Local memory is laid out by the machine so that the same field of neighbouring threads lies side by side, it

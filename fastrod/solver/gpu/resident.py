@@ -33,7 +33,7 @@ class Resident:
         self._stale_there: set[str] = set(FIELDS)
 
     def shape(self, field: str) -> tuple[int, ...]:
-        """Of a field, without a copy."""
+        """Shape of a field, without a copy."""
         found: tuple[int, ...] = getattr(self._host, field).shape
         return found
 
@@ -45,8 +45,8 @@ class Resident:
         return self._host
 
     def write(self, fields: Iterable[str] = FIELDS) -> Memory:
-        """As `read`, and the caller may write into these fields: the device takes them over before its next
-        pass."""
+        """See `read`, and the caller may write into these fields: the device takes them over before its
+        next pass."""
         self._stale_there.update(fields)
         return self.read(fields)
 

@@ -21,7 +21,7 @@ _BY_UPDATE = ("x", "covariance", "gain", "defect", "length_before", "force_befor
 
 
 class Runner:
-    """What the device holds besides the memory: robots and ports as they were last given, and what the last
+    """Buffers on the device besides the memory: robots and ports as they were last given, and what the last
     passes wrote.
 
     Robots and ports are replaced, never changed in place; so an array that is the same object is not sent

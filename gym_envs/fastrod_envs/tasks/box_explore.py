@@ -39,11 +39,12 @@ from fastrod_scenes.ur5.look import aim_jacobian, miss
 STEP = 0.05
 """Longest time that one step of the soft robot takes [s]."""
 START_BEND = 0.1
-"""Of each segment at the start, either way [rad]."""
+"""Largest bend of each segment at the start, either way [rad]."""
 EXTENSION_RATE, BEND_RATE = 0.04, 2.0
 """Largest [m/s], [rad/s]."""
 LEAST_PIXELS = 20
-"""Of the cube in the tip's picture, for its corner to be seen (as the scene `explore` has it)."""
+"""Least number of pixels of the cube in the tip's picture, for its corner to be seen (as the scene
+`explore` has it)."""
 FAR, FINE = 0.2, 0.03
 """The miss is observed twice, up to these lengths [m]."""
 NEAR_WALL = 0.05
@@ -58,7 +59,7 @@ _POINTS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class BoxExploreOptions(EnvOptions):
-    """Of BoxExplore."""
+    """Options of BoxExplore."""
 
     camera: bool = False
     """Observe also where in the tip's picture the cube's colour is seen; a picture of 48 x 36 pixels is drawn
@@ -291,7 +292,7 @@ class _Inside(Cell):
         )
 
     def picture(self, width: int, height: int) -> np.ndarray:
-        """From the side, its wall cut away, and in a corner what the tip sees."""
+        """Return a picture from the side, its wall cut away, and in a corner what the tip sees."""
         self._pose()
         side = HostCamera(width=width, height=height, fov=36.0, near=0.8005, far=4.0)
         rgb = side.look(self.world, (0.78, -1.0, 0.45), (0.78, 0.0, 0.45)).rgb
@@ -305,7 +306,7 @@ class _Inside(Cell):
         self.world.disconnect()
 
     def _notice(self, gap: float) -> None:
-        """What observation and reward need."""
+        """Update what observation and reward need."""
         self._gap = gap
         self._miss = miss(self.soft.tip, self.soft.tip_rotation, self._goal)
         self._off = float(math.hypot(*self._miss))
@@ -338,13 +339,13 @@ class _Inside(Cell):
         self.bracket.follow()
 
     def _look(self, camera: HostCamera) -> Image:
-        """From before the tip's cap, along d3; d2 is up in it."""
+        """Take a picture from before the tip's cap, along d3; d2 is up in it."""
         rotation = self.soft.tip_rotation
         eye = self.soft.tip + 1.2 * RADIUS * rotation[:, 2]
         return camera.look(self.world, eye, eye + 0.1 * rotation[:, 2], rotation[:, 1])
 
     def _pixels(self) -> int:
-        """Of the cube, in its colour, in the tip's picture."""
+        """Return the number of pixels of the cube, in its colour, in the tip's picture."""
         self._pose()
         image = self._look(_EYE)
         hue = image.rgb / np.maximum(np.linalg.norm(image.rgb, axis=2, keepdims=True), 1.0)

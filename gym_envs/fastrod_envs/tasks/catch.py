@@ -18,11 +18,11 @@ SEGMENT = 0.1
 STIFFNESS = 0.0022
 """EI [N m^2]."""
 OFFSET = 0.01
-"""Of the tendons from the backbone [m]."""
+"""Offset of the tendons from the backbone [m]."""
 BEND, EXTENSION = 0.012, (-0.02, 0.02)
 """Ranges of a bend, plus and minus, and of the last segment's extension [m]."""
 LARGEST_LOAD = 0.15
-"""Of the undeclared tip force [N]."""
+"""Largest load of the undeclared tip force [N]."""
 SLOWEST, FASTEST = 0.02, 0.08
 """Speeds of the target [m/s]."""
 NEAR = 0.05

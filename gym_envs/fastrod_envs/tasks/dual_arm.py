@@ -21,21 +21,22 @@ from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
 HEIGHT = 0.3
-"""Of both bases, world [m]."""
+"""Height of both bases, world [m]."""
 BASE = 0.27
-"""Of either base from the middle, along x [m]; the first robot's is at -x, and they look at each other."""
+"""Base of either base from the middle, along x [m]; the first robot's is at -x, and they look at each
+other."""
 BALL = 0.018
 """Radius of what is passed [m]."""
 GOAL, SPREAD = (0.06, 0.0, HEIGHT), (0.02, 0.06, 0.05)
 """Middle of the goals, and how far they are from there at most, world [m]."""
 START_BEND = 0.2
-"""Of each segment at the start, either way [rad]."""
+"""Largest bend of each segment at the start, either way [rad]."""
 SPEED = 0.1
 """Largest of a tip along x, y and z [m/s]."""
 WORKSPACE = ((-0.11, -0.1, HEIGHT - 0.1), (-0.01, 0.1, HEIGHT + 0.1))
-"""Where the first tip may be sent, world [m]; the second's range is its mirror image."""
+"""Box in which the first tip may be sent, world [m]; the second's range is its mirror image."""
 EXTENSION, LARGEST_BEND = 0.03, 1.2
-"""Of a segment, either way [m], [rad]."""
+"""Largest extension [m] and bend [rad] of a segment, either way."""
 EXTENSION_RATE, BEND_RATE = 0.08, 2.0
 """Largest of a segment [m/s], [rad/s]."""
 SLIP = 0.004
@@ -345,7 +346,7 @@ class _Pair(Cell):
         return np.array(b.multiplyTransforms(*back, *b.getBasePositionAndOrientation(self.ball))[0])
 
     def _look(self) -> None:
-        """Where the ball is, and how far the robots are from each other."""
+        """Update the ball's position, and the distance of the robots from each other."""
         self.place = np.array(self.world.getBasePositionAndOrientation(self.ball)[0])
         self._gap = float(np.linalg.norm(self.place - self.softs[1].tip)) - _HOLD
         between = (

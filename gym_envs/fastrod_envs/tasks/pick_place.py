@@ -28,13 +28,13 @@ from fastrod_scenes.ur5.picking import ADAPTER, SIDE, TOP, WIDTH
 
 Grip = Literal["suction", "gripper"]
 HOME = (0.5, 0.0, TOP + SIDE + 0.11)
-"""Where the tip would be at the start without its weight, world [m]."""
+"""Position of the tip at the start without its weight, world [m]."""
 CUBE, SPOT = (0.5, -0.12), (0.5, 0.12)
 """Middle of where the cube starts, and of where it is to go, world [m]."""
 SPREAD = (0.08, 0.07)
-"""How far either may be from there, in x and in y [m]."""
+"""Largest distance of either from there, in x and in y [m]."""
 NEAREST = 0.04
-"""Of cube and spot from y = 0 at difficulty 0 [m]."""
+"""Least distance of cube and spot from y = 0 at difficulty 0 [m]."""
 SPEED, BEND_RATE = 0.25, 1.0
 """Largest of the tip along x, y and z [m/s], and of the bend [rad/s]."""
 BEND, START_BEND = 0.8, 0.3
@@ -42,8 +42,8 @@ BEND, START_BEND = 0.8, 0.3
 REST = 0.02
 """Largest speed of a cube that rests [m/s]."""
 LIFT, PRESS = 0.06, 0.006
-"""Of the baseline: how high it lifts the cube, and how far below a place it aims, so that it gets there
-[m]."""
+"""Heights of the baseline [m]: how high it lifts the cube, and how far below a place it aims, so that it
+gets there [m]."""
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 _HEAD = RADIUS + 0.0025  # m
@@ -61,7 +61,7 @@ _POINTS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class PickPlaceOptions(EnvOptions):
-    """Of PickPlace."""
+    """Options of PickPlace."""
 
     grip: Grip = "suction"
     """`suction`: the head holds what it touches; `gripper`: two fingers hold by friction."""
@@ -402,7 +402,7 @@ class _Table(Cell):
             self.held = False
 
     def _look(self) -> None:
-        """Where the cube is, how fast, and whether the fingers hold it."""
+        """Update the cube's position and speed, and whether the fingers hold it."""
         b = self.world
         place, orientation = b.getBasePositionAndOrientation(self.cube)
         self.place, self._orientation = np.array(place), from_xyzw(orientation)

@@ -11,7 +11,7 @@ from fastrod_envs.pushing import PushTask
 from fastrod_scenes.a1.quadruped import neck
 
 HEIGHT = 0.5
-"""From which the robot hangs [m]."""
+"""Height from which the robot hangs [m]."""
 
 
 def course() -> Course:

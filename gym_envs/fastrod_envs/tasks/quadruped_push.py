@@ -17,7 +17,7 @@ from fastrod_envs.pushing import PushTask
 from fastrod_scenes.a1.quadruped import neck, standing
 
 PITCH = -0.9
-"""Of the neck's mount [rad]."""
+"""Pitch of the neck's mount [rad]."""
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from fastrod_envs.task import Backdrop, Ball, Field, Outcome, length, shortened
 Reward = Literal["paper", "precise"]
 Point = tuple[float, ...]
 BASE = (0.0, 0.0, 0.5)
-"""Of the robot, which hangs from there, world [m]."""
+"""Base of the robot, which hangs from there, world [m]."""
 LEAST, LARGEST = (-0.2, -0.2, 0.1), (0.2, 0.2, 0.25)
 """Corners of the box of goals, world [m]."""
 LOWEST, HIGHEST = 0.07, 0.28
@@ -29,17 +29,17 @@ LOWEST, HIGHEST = 0.07, 0.28
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 LENGTH = 0.5
-"""Of the robot [m]: what distances of another robot's Reach are scaled by."""
+"""Length of the robot [m]: what distances of another robot's Reach are scaled by."""
 BEND = 1.6
-"""Of a segment of another robot, toward d1 and d2, at most [rad]: that of the paper's, 12 mm of tendons at
-7.5 mm."""
+"""Largest bend of a segment of another robot, toward d1 and d2 [rad]: that of the paper's, 12 mm of
+tendons at 7.5 mm."""
 _N_GOALS = 512  # postures whose tips are another robot's goals
 _HALF = 0.5  # of the limits: from anywhere within them the baseline finds all goals of the shipped robots
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReachRewardOptions(EnvOptions):
-    """Of ReachObstacle, and of Reach among others."""
+    """Reward options of ReachObstacle, and of Reach among others."""
 
     reward: Reward = "paper"
     """`paper`: its formula; `precise`: with exp(-d / 0.01 m) on top, which still rises within the last
@@ -55,7 +55,7 @@ class ReachRewardOptions(EnvOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReachOptions(ReachRewardOptions):
-    """Of Reach."""
+    """Options of Reach."""
 
     robot: Robot | str | Path | None = None
     """None: the paper's, hanging. A robot, a shipped robot's name or a robot file: yours, where its file has
@@ -77,7 +77,7 @@ def hanging_robot() -> Robot:
 
 
 class ReachTask(RodTask):
-    """What Reach and ReachObstacle share: robot, goals, observation."""
+    """Base of Reach and ReachObstacle: robot, goals, observation."""
 
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 3
@@ -87,7 +87,7 @@ class ReachTask(RodTask):
     kept_jacobian_tolerance = 1e-4
     dt = 0.05
     size = 1.0
-    """Of the robot against the paper's: what distances are divided by."""
+    """Size of the robot against the paper's: what distances are divided by."""
 
     def prepare(self, least: Point = LEAST, largest: Point = LARGEST, longer: float = 0.05) -> None:
         """Parts of observations, by the corners of the box of goals, world [m], and how much longer than at
@@ -221,8 +221,8 @@ def drives() -> tuple[Ints, Floats, Floats]:
 
 
 def drives_of(robot: Robot) -> tuple[Ints, Floats, Floats]:
-    """As `drives`, of any robot whose segments are driven by the lengths of tendons around them: all bends,
-    up to `BEND`, and the extensions that its file allows. Raises `InputError` for another robot."""
+    """See `drives`, of any robot whose segments are driven by the lengths of tendons around them: all
+    bends, up to `BEND`, and the extensions that its file allows. Raises `InputError` for another robot."""
     try:
         offset = SegmentActions(robot).offset
     except RobotError as error:

@@ -21,7 +21,8 @@ from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Outcome, length,
 Shape = Literal["triangle", "square", "circle"]
 Reward = Literal["paper", "precise"]
 PERIOD, APPROACH = 9.0, 1.0
-"""Of a turn; before the error counts, as the tip begins at rest [s]."""
+"""Time of a turn, and time before the error counts, as the tip begins at rest [s]; before the error
+counts, as the tip begins at rest [s]."""
 AHEAD = (0.1, 0.2, 0.4)
 """The path is observed so far ahead of now [s]."""
 NEAR = 0.01
@@ -29,7 +30,7 @@ NEAR = 0.01
 MEMORY = 0.5
 """Time constant of the error's mean that is observed [s]: what integral action would go by."""
 DT = 0.05
-"""Of a step [s]."""
+"""Time of a step [s]."""
 DRIVEN, LIMIT, RATE = (1, 2), ((-0.008, 0.008), (-0.008, 0.008)), (0.01, 0.01)
 """Numbers of the robot's action (`SegmentActions`) that are driven; their least and largest [m]; their
 largest rate [m/s]."""
@@ -39,7 +40,7 @@ RADIUS = 0.03
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions(EnvOptions):
-    """Of Track."""
+    """Options of Track."""
 
     path: Shape | Literal["any"] = "any"
     """Which path; `any` draws one for each episode."""
@@ -93,7 +94,7 @@ def coming(path: Callable[[float], Floats]) -> Floats:
 
 @final
 class TrackSight:
-    """What n robots remember of their errors, and the state that they observe."""
+    """Memory of n robots' errors, and the state that they observe."""
 
     def __init__(self, n: int) -> None:
         self._last = np.zeros((n, 2))

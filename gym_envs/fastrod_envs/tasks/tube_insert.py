@@ -26,7 +26,7 @@ BODY = 0.002
 STIFFNESS = 1e-3
 """EI [N m^2]."""
 OFFSET = 0.0015
-"""Of the tendons from the backbone [m]."""
+"""Offset of the tendons from the backbone [m]."""
 STRAIGHT, BEND_RADIUS, ANGLE = 0.015, 0.07, math.radians(60.0)
 """The tube: length before the turn [m], radius of the turn of its middle [m], and by how much it turns
 [rad]."""
@@ -46,7 +46,7 @@ LAG = 0.006
 """The baseline bends a segment as the tube does so far behind its end: one that is half in the turn bends
 outside of it too [m]."""
 GAIN = 20.0
-"""Of the baseline: bend of the outer segment per distance of the tip from the tube's middle [rad/m]."""
+"""Gain of the baseline: bend of the outer segment per distance of the tip from the tube's middle [rad/m]."""
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 PATIENCE = 5

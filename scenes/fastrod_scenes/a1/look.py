@@ -15,13 +15,13 @@ from fastrod_scenes.a1.quadruped import RADIUS, neck, standing
 from fastrod_scenes.scene import HostedScene, SceneStage
 
 PITCH = 0.9
-"""Of the neck's mount, above forward [rad]."""
+"""Pitch of the neck's mount, above forward [rad]."""
 STRETCH = 0.03
-"""Of each segment [m]."""
+"""Stretch of each segment [m]."""
 MIDDLE = (0.67, 0.0)
-"""Of the box, world [m]."""
+"""Middle of the box, world [m]."""
 WIDTH, HEIGHT, WALL = 0.3, 0.26, 0.01
-"""Of the box inside, its walls and their thickness [m]."""
+"""Size of the box inside, its walls and their thickness [m]."""
 SWAY = 0.25
 """Bend of the neck to either side while it looks [rad]."""
 CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -73,7 +73,7 @@ class _Look(SceneStage):
         self.rod.step(**self.bends(*_script((t + self.world.dt) / NeckLook.duration)))
 
     def picture(self) -> Image:
-        """Of the camera in the tip, which looks along the neck; d1 is up in it."""
+        """Picture of the camera in the tip, which looks along the neck; d1 is up in it."""
         state = self.rod.state
         assert state is not None
         axes, eye = (

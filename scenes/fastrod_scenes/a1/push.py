@@ -16,13 +16,13 @@ from fastrod_scenes.scene import HostedScene, SceneStage
 SIZE, MASS = 0.08, 0.05
 """Edge [m] and mass [kg] of the cube."""
 PLACE = (0.36, 0.0, SIZE / 2)
-"""Of its middle at first, world [m]."""
+"""Place of its middle at first, world [m]."""
 PITCH = -1.4
-"""Of the neck's mount [rad]."""
+"""Pitch of the neck's mount [rad]."""
 SWING = 1.1
 """Amplitude of the neck's bend, all segments together [rad]."""
 STRETCH = 0.024
-"""Of each segment where the neck is bent most: a bent neck is shorter, and its tip would rise [m]."""
+"""Stretch of each segment where the neck is bent most: a bent neck is shorter, and its tip would rise [m]."""
 RATE = 2.0
 """omega of its gait [rad/s]."""
 FOLLOWS = 0.1

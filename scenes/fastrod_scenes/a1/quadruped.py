@@ -13,9 +13,9 @@ from fastrod.rotation import quaternion_from_matrix
 OFFSET = 0.012
 """Distance of the neck's tendons from its backbone [m]."""
 RADIUS = 0.018
-"""Of the neck [m]."""
+"""Radius of the neck [m]."""
 MOUNT = (0.25, 0.0, 0.06)
-"""Of the neck on the head, trunk frame: x forward, z up [m]."""
+"""Position of the neck on the head, trunk frame: x forward, z up [m]."""
 _HEIGHT = 0.3
 _STANCE = {"hip": 0.0, "upper": 0.8, "lower": -1.6}  # rad
 _REST = 200  # steps until it stands still on its own

@@ -23,7 +23,7 @@ BODY = 0.002
 STIFFNESS = 3e-4
 """EI [N m^2]."""
 OFFSET = 0.0015
-"""Of the tendons from the backbone [m]."""
+"""Offset of the tendons from the backbone [m]."""
 OUTSIDE, INSIDE = -0.005, 0.09
 """Depth of the fed length, at first and at last, along z from the entry [m]."""
 LAG = 0.0063

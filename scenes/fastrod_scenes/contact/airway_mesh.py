@@ -30,7 +30,7 @@ OUTLET = 0.012
 BRANCHES = {"left": math.radians(160.0), "right": math.radians(20.0)}
 """Direction in which each bronchus bends, about z from x toward y [rad]."""
 RADIUS = 0.006
-"""Of the lumen of a bronchus [m]."""
+"""Radius of the lumen of a bronchus [m]."""
 WALL = 0.004
 """Thickness [m]."""
 BLEND = 0.004

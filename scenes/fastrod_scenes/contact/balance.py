@@ -30,7 +30,7 @@ class Worst(NamedTuple):
     depth: float
     """[m]"""
     passes: int
-    """Of one step of one robot."""
+    """Iterations of one step of one robot."""
     contacts: int
     """On one robot at once."""
 

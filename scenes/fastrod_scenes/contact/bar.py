@@ -18,17 +18,17 @@ from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, watch, wor
 from fastrod_scenes.scene import RodScene
 
 RADIUS = 0.065
-"""Of the bar, whose axis is along y [m]: what fits into a triangle of this robot."""
+"""Radius of the bar, whose axis is along y [m]: what fits into a triangle of this robot."""
 ROD = 0.012
 """Radius of the robot [m]."""
 GAP = 0.001
 """Between the straight robot and the bar [m]."""
 HEIGHT = 0.05
-"""Of the bar's axis above the base: the middle of the first segment [m]."""
+"""Height of the bar's axis above the base: the middle of the first segment [m]."""
 FIRST, SECOND = 2.1, 2.18
 """Bend of the second and of the fourth segment at the end, about y [rad]."""
 OFFSET = 0.0075
-"""Of the robot's tendons from its backbone [m]."""
+"""Offset of the robot's tendons from its backbone [m]."""
 
 
 @final

@@ -26,7 +26,7 @@ WEIGHT = 0.3 * 9.81
 BODY = 0.005
 """Radius of the rod [m]."""
 RADIUS = 0.03
-"""Of the cylinder, whose axis is level and across the rod [m]."""
+"""Radius of the cylinder, whose axis is level and across the rod [m]."""
 UNDER = LENGTH / 2.0
 """Distance of the cylinder from the clamp [m]."""
 LOW, HIGH = -0.11, -RADIUS - BODY

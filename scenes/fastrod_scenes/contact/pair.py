@@ -25,9 +25,9 @@ GAP = 0.006
 CROSSING = 0.25
 """Distance of the crossing from both bases [m]."""
 BEND = 0.25
-"""Of the first rod toward the second at the end [rad]."""
+"""Bend of the first rod toward the second at the end [rad]."""
 OFFSET = 0.01
-"""Of the tendons from the backbone [m]."""
+"""Offset of the tendons from the backbone [m]."""
 CONTACT_GAP = 1e-7
 """Largest gap of a contact that presses [m]."""
 

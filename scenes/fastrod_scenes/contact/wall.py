@@ -13,9 +13,9 @@ from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, rises, wat
 from fastrod_scenes.scene import RodScene
 
 DISTANCE = 0.02
-"""Of the wall from the base, along x [m]."""
+"""Distance of the wall from the base, along x [m]."""
 PULL = 0.009
-"""Of the tendon toward the wall at the end, let out by the one across [m]."""
+"""Pull of the tendon toward the wall at the end, let out by the one across [m]."""
 
 
 @final

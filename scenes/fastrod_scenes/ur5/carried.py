@@ -16,9 +16,9 @@ from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.types import Floats
 
 OFFSET = 0.0075
-"""Of the tendons from the backbone [m]."""
+"""Offset of the tendons from the backbone [m]."""
 RADIUS = 0.012
-"""Of the body [m]."""
+"""Radius of the body [m]."""
 
 
 def soft_robot(name: str, n_segments: int, *, extension: float = 0.03, line_density: float = 0.1) -> Robot:

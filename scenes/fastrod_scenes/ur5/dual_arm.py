@@ -16,9 +16,10 @@ from fastrod_scenes.scene import HostedScene, SceneStage
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, eased, soft_robot
 
 APART, DEEP, PRONG = 0.06, 0.04, 0.02
-"""Of the fork: either prong from the flange's axis, the crossbar before the flange, length of a prong [m]."""
+"""Sizes of the fork: either prong from the flange's axis, the crossbar before the flange, length of a
+prong [m]."""
 TILT = math.radians(20.0)
-"""Of either prong, outward [rad]."""
+"""Tilt of either prong, outward [rad]."""
 FLANGE = (0.45, 0.10, 0.60, 0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0)
 """Pose in which the UR5 holds still: position [m] and quaternion w x y z, world; the flange looks down, the
 fork is along y."""
@@ -30,11 +31,12 @@ ROTATION = 0.15
 ELBOW_UP = (0.0, -1.5, 1.6, -1.7, -1.57, 0.0)
 """Joints of the UR5 near that pose [rad]."""
 PERIOD, STILL, MOVE = 2.0, 3.0, 6.0
-"""Of the soft robots' motion; of the UR5: at first it holds still, then it moves [s]."""
+"""Times of the soft robots' motion and of the UR5's [s]; of the UR5: at first it holds still, then it
+moves [s]."""
 BENDS = (0.35, 0.7)
-"""Of the segments, base first [rad]."""
+"""Bends of the segments, base first [rad]."""
 EXTENSION = 0.02
-"""Of the outer segment, in either direction [m]."""
+"""Extension of the outer segment, in either direction [m]."""
 POSE_ERROR = 1e-6
 """Largest of a base from its mount [m], and of its axes."""
 FORCE_ERROR = 1e-5
@@ -167,7 +169,8 @@ class DualArmScene(SceneStage):
         return np.asarray((tips - flange[:3]) @ matrix_from_quaternion(flange[None, 3:])[0])
 
     def weight(self) -> float:
-        """Of both soft robots, as long as they are now [N]: their mass per length stays as they extend."""
+        """Weight of both soft robots, as long as they are now [N]: their mass per length stays as they
+        extend."""
         density = self.actions.robot.segments[0].line_density
         return (
             9.81

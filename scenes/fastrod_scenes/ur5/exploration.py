@@ -21,7 +21,7 @@ from fastrod_scenes.ur5.look import aim_jacobian, miss
 ADAPTER = 0.03
 """Length of the bracket between flange and soft robot [m]."""
 INTO = (0.5, 0.5, 0.5, 0.5)
-"""Of the flange as the robot enters, w x y z: its x, y, z are y, z, x of the world."""
+"""Orientation of the flange as the robot enters, w x y z: its x, y, z are y, z, x of the world."""
 BEFORE = 0.05
 """Distance from the straight robot's tip to the entry, before it enters [m]."""
 STANDOFF = 0.03
@@ -32,9 +32,9 @@ ENTRY = (0.006, 0.008, 0.008, 0.7, 0.06, 0.06)
 """Tolerance of a flange about the middle of the entry: displacement [m], and rotation about x, y and z
 [rad]."""
 EXTENSION = 0.03
-"""Of a segment, in either direction [m]."""
+"""Extension of a segment, in either direction [m]."""
 LARGEST_BEND = 1.7
-"""Of a segment [rad]."""
+"""Largest bend of a segment [rad]."""
 FORWARD, BACKWARD = (0.0, 0.3, 0.3), (-0.2, 1.2, 1.4)
 """Bends of the segments toward a corner that roughly look at it, in the back and in the front of the box
 [rad]."""
@@ -59,7 +59,7 @@ class Look(NamedTuple):
     rotation: Floats
     """(3, 3) world_from_camera: right, up, and back from what it looks at."""
     miss: float
-    """Of the line of sight from the middle of the corner's cube [m]."""
+    """Miss of the line of sight from the middle of the corner's cube [m]."""
 
 
 @final
@@ -105,7 +105,7 @@ class Exploration(SceneStage):
         )
         self.camera = HostCamera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
         self.looks: dict[int, Look] = {}
-        """Of each corner, by its number."""
+        """Looks of each corner, by its number."""
         self.rod.settle(**self.actions.inputs(self.action))
 
     def flange(self, t: float) -> Floats:
@@ -228,13 +228,13 @@ class Exploration(SceneStage):
         return any(p[8] <= 0.0 for p in self.world.getContactPoints(self.arm.body, self.walls))
 
     def arm_distance(self, within: float = 0.3) -> float:
-        """Of the UR5's links from the box, at most `within` [m]."""
+        """Distance of the UR5's links from the box, at most `within` [m]."""
         return min(
             (float(p[8]) for p in self.world.getClosestPoints(self.arm.body, self.walls, within)),
             default=within,
         )
 
     def soft_clearance(self, within: float = 0.1) -> float:
-        """Of the soft robot from the box, at most `within` [m]; negative inside a wall."""
+        """Clearance of the soft robot from the box, at most `within` [m]; negative inside a wall."""
         near = (self.world.getClosestPoints(own, self.walls, within) for own in self.rod.bodies.ids)
         return min((float(p[8]) for points in near for p in points), default=within)

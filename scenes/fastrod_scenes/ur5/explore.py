@@ -12,7 +12,7 @@ from fastrod_scenes.ur5.box import CORNERS, Box
 from fastrod_scenes.ur5.exploration import END, Exploration
 
 LEAST_PIXELS = 20
-"""Of a corner's cube in the picture of it, for the corner to be seen."""
+"""Least number of pixels of a corner's cube in the picture of it, for the corner to be seen."""
 DEPTH_ERROR = 0.003
 """Largest of those pixels [m]: half of a pixel beside an edge."""
 MISS = 0.002

@@ -21,21 +21,22 @@ from fastrod_scenes.scene import HostedWorld, SoftBody
 from fastrod_scenes.ur5.carried import Bracket, eased
 
 SIDE = 0.03
-"""Of the cube [m]."""
+"""Side of the cube [m]."""
 TOP = 0.15
-"""Of the table [m]."""
+"""Height of the table [m]."""
 SPOT = (0.5, 0.16)
 """Target of the cube, world [m]."""
 HOME = (0.42, 0.0, TOP + 0.22)
-"""Of the tip at the start, world [m]."""
+"""Position of the tip at the start, world [m]."""
 LIFT = 0.14
 """[m]"""
 BEND = 1.0
-"""Of the soft robot when it puts the cube down, base to tip [rad]; it is straight when it picks it up."""
+"""Bend of the soft robot when it puts the cube down, base to tip [rad]; it is straight when it picks it
+up."""
 ADAPTER = 0.04
-"""Of the bracket between flange and soft robot [m]."""
+"""Size of the bracket between flange and soft robot [m]."""
 RADIUS = 0.015
-"""Of the soft robot's body [m]."""
+"""Radius of the soft robot's body [m]."""
 WIDTH = 0.05
 """Between the open fingers [m]."""
 _HEAD = RADIUS + 0.0025  # m, the head's radius
@@ -61,7 +62,7 @@ class Phase(NamedTuple):
     tip: tuple[float, float, float]
     """World, at its end [m]."""
     bend: float
-    """Of the soft robot, at its end [rad]."""
+    """Bend of the soft robot, at its end [rad]."""
 
 
 class Cube(NamedTuple):
@@ -95,7 +96,7 @@ def script(cube: Cube, fingers: bool) -> tuple[Phase, ...]:
 
 
 def duration(*, fingers: bool) -> float:
-    """Of the script [s]."""
+    """Duration of the script [s]."""
     return math.fsum(phase.duration for phase in script(Cube(), fingers))
 
 
@@ -126,7 +127,7 @@ class Picking(HostedWorld):
         self._ends = np.cumsum([phase.duration for phase in self.script])
         self._before = Phase("home", 0.0, HOME, 0.0)
         self.phase = self.script[0]
-        """Of the last step."""
+        """Phase of the last step."""
         self._bend = 0.0
         self._q = self._joints(np.array(HOME), 0.0, np.array(_ELBOW_UP))
         self.arm.place(self._q)
@@ -174,7 +175,7 @@ class Picking(HostedWorld):
         return float(np.arctan2(np.linalg.norm(np.cross(*ends)), ends[0] @ ends[1]))
 
     def cube_pose(self) -> tuple[Floats, Floats]:
-        """Of the cube: position (3,) world [m] and rotation (3, 3) world_from_cube."""
+        """Pose of the cube: position (3,) world [m] and rotation (3, 3) world_from_cube."""
         position, quaternion = self.world.getBasePositionAndOrientation(self.cube)
         return np.array(position), matrix_from_quaternion(from_xyzw(quaternion)[None])[0]
 
@@ -189,7 +190,7 @@ class Picking(HostedWorld):
 
     @property
     def mass(self) -> float:
-        """Of the cube, as the world has it [kg]."""
+        """Mass of the cube, as the world has it [kg]."""
         return float(self.world.getDynamicsInfo(self.cube, -1)[0])
 
     def off_flange(self) -> float:

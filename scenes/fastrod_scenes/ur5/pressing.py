@@ -20,11 +20,11 @@ START = (0.0, -1.2, 1.4, -1.77, -1.57, 0.0)
 SWING = 0.04
 """Rotation of the first joint to the plate, and back [rad]."""
 BEND = 0.9
-"""Of the soft robot, both segments together [rad]."""
+"""Bend of the soft robot, both segments together [rad]."""
 ADAPTER = 0.03
 """Between flange and soft robot [m]."""
 SPRING, DAMPER, MASS = 8.0, 4.0, 0.2
-"""Of the plate: [N/m], [N s/m], [kg]."""
+"""Constants of the plate: [N/m], [N s/m], [kg]."""
 _THICK, _GAP = 0.01, 0.04  # of the plate, and between it and the straight robot [m]
 
 

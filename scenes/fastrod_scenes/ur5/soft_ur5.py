@@ -20,21 +20,21 @@ from fastrod_scenes.ur5.carried import OFFSET, Bracket, soft_robot
 Movers: TypeAlias = Literal["both", "arm", "soft"]
 """Choice of what moves: arm and soft robot, or one while the other is held."""
 ADAPTER = 0.03
-"""Of the bracket between flange and soft robot [m]."""
+"""Size of the bracket between flange and soft robot [m]."""
 EXTENSION = 0.03
 """Largest of a segment; the least is none [m]."""
 LARGEST_BEND = 2.0
-"""Of a segment toward d1, and toward d2 [rad]."""
+"""Largest bend of a segment toward d1, and toward d2 [rad]."""
 STRAIGHT = (0.5 * EXTENSION, 0.0, 0.0) * 2
 """Actions at the start: straight, extended by half of what is possible [m]."""
 DEPTH = 0.2 + EXTENSION
-"""Of the tip below the base then [m]."""
+"""Depth of the tip below the base then [m]."""
 DOWN = (0.0, 1.0, 0.0, 0.0)
-"""Of the flange at the start, w x y z: z down, x along the world's."""
+"""Orientation of the flange at the start, w x y z: z down, x along the world's."""
 ELBOW_UP = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
 """Joints of the UR5 near which the flange looks down from above [rad]."""
 GAIN = 10.0
-"""Of the tip's error [1/s]."""
+"""Gain of the tip's error [1/s]."""
 ERROR_LIMIT = 0.1
 """A longer error counts as this one [m]."""
 POSTURE_GAIN = 2.0
@@ -164,7 +164,7 @@ class SoftUR5:
         return ArmStep(self.tip(), jacobian[:, n:] @ displacement[n:], jacobian[:, :n] @ displacement[:n])
 
     def clearance(self, within: float = 0.1) -> float:
-        """Of the soft robot from the arm's links, at most `within` [m]; negative inside one."""
+        """Clearance of the soft robot from the arm's links, at most `within` [m]; negative inside one."""
         near = (self.world.getClosestPoints(own, self.arm.body, within) for own in self.rod.bodies.ids)
         return min((float(p[8]) for points in near for p in points), default=within)
 

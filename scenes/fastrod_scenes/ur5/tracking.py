@@ -14,20 +14,20 @@ from fastrod_scenes.scene import HostedScene, SceneStage
 from fastrod_scenes.ur5.soft_ur5 import DEPTH, Movers, SoftUR5
 
 CENTER = (0.5, 0.0, 0.3)
-"""Of the paths, world [m]."""
+"""Center of the paths, world [m]."""
 PERIOD = 20.0
-"""Of a path [s]."""
+"""Period of a path [s]."""
 APPROACH = 2.0
 """The tip starts from the center while the goal is on the path from t = 0 on; from here on it must have
 caught up [s]."""
 LARGEST_ERROR = 1e-6
 """Mean square, over time and over x, y and z [m^2]."""
 LEAST_FRACTION = 0.5
-"""Of the motion by the soft robot."""
+"""Least fraction of the motion by the soft robot."""
 LEAST_CLEARANCE = 0.005
-"""Of the soft robot from the arm [m]."""
+"""Least clearance of the soft robot from the arm [m]."""
 LARGEST_LAG = 2e-4
-"""Of a step's tip from where it would come to rest [m]."""
+"""Largest distance of a step's tip from where it would come to rest [m]."""
 _SAMPLE = 0.5  # s, between two looks at clearance and lag
 
 
@@ -54,7 +54,8 @@ class Record(NamedTuple):
     """Largest after the approach, of the tip from where it would come to rest [m]."""
 
     def mean_square(self, start: float, end: float = np.inf) -> float:
-        """Of the tip's error between two times [s], mean over the steps and over x, y and z [m^2]."""
+        """Mean square of the tip's error between two times [s], mean over the steps and over x, y and z
+        [m^2]."""
         on = (self.t > start + 1e-9) & (self.t <= end + 1e-9)
         return float(((self.goal - self.tip)[on] ** 2).mean())
 
@@ -64,7 +65,7 @@ class Record(NamedTuple):
         return fraction_of(self.by_soft[on], self.displacement[on])
 
     def lengths(self, start: float) -> tuple[float, float]:
-        """Of the tip's paths by the soft robot alone and by the arm alone, from a time [s] on [m]."""
+        """Lengths of the tip's paths by the soft robot alone and by the arm alone, from a time [s] on [m]."""
         on = self.t > start + 1e-9
         by_soft, by_arm = (
             float(np.linalg.norm(component[on], axis=1).sum()) for component in (self.by_soft, self.by_arm)
@@ -123,7 +124,7 @@ class TrackingScene(HostedScene):
     shape: ClassVar[str]
     """Name of the trajectory; its sizes are the paper's."""
     sizes: ClassVar[dict[str, float]]
-    """Of the trajectory [m]."""
+    """Sizes of the trajectory [m]."""
 
     paper: ClassVar[float]
     """The paper's mean squared error [m^2]."""

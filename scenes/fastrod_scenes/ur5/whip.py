@@ -60,7 +60,7 @@ class Cracking(MujocoStage):
 
 
 class Crack(NamedTuple):
-    """What is measured at each step of the scene."""
+    """Measurements at each step of the scene."""
 
     speed: Floats
     """(n,) of the tip, world [m/s]."""

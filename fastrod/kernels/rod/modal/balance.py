@@ -1,4 +1,5 @@
-"""From tip to base: what every node must be given, what the rod carries, and the work on the modes."""
+"""Balance from tip to base: what every node must be given, what the rod carries, and the work on the
+modes."""
 
 from __future__ import annotations
 

@@ -8,8 +8,9 @@ from ...jit import kernel
 from ..lanes import LaneMatrix, Lanes, W
 
 PIVOT = 1e-9
-"""Of a diagonal entry: a pivot below it is none, and the diagonal stands for it. Without that, heavy upright
-five-segment robots ended in NaN one step after an impact (BDF2 and generalized-alpha at 1 ms)."""
+"""Smallest pivot, as a fraction of a diagonal entry: a pivot below it is none, and the diagonal stands for
+it. Without that, heavy upright five-segment robots ended in NaN one step after an impact (BDF2 and
+generalized-alpha at 1 ms)."""
 
 
 @kernel

@@ -75,7 +75,7 @@ def gather_all(robots: Ints, batch: ModalBatch, command: Floats, work: ModalWork
 
 @kernel
 def start_settling(robots: Ints, motion: ModalMotion, work: ModalWork) -> None:
-    """From the q that the robots have, without inertia."""
+    """Start from the q that the robots have, without inertia."""
     for w in range(W):
         work.scheme[w], work.scheme[W + w] = 0.0, 0.0
         for a in range(motion.q.shape[1]):

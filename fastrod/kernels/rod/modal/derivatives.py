@@ -58,7 +58,7 @@ AFTER_JUMP = 4
 
 
 class ModalDerivatives(NamedTuple):
-    """What there is to know of robots near a shape; arrays of length 0 are not wanted."""
+    """Derivatives of robots near a shape; arrays of length 0 are not wanted."""
 
     gradient: Floats
     """(n_robots, n_q) of the energy by the unknowns; without what follows the rod it vanishes at rest."""
@@ -189,7 +189,7 @@ def write_nodes(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, out
 def write_lumps(
     robots: Ints, n_robots: int, batch: ModalBatch, work: ModalWork, out: ModalDerivatives
 ) -> None:
-    """As `write_nodes`, of the lumps."""
+    """See `write_nodes`, of the lumps."""
     row = work.scratch
     n_pieces, n_nodes, n_modes = work.node.shape[0], work.node.shape[1], work.end.shape[1]
     n = n_lumps(batch.motion, work)
@@ -225,7 +225,8 @@ def derivatives_of_modes(
     every: ModalWork,
     out: ModalDerivatives,
 ) -> None:
-    """Of a chunk at `unknowns` (n_robots, n_q): at rest, or in a step of `run` from the motion in `batch`."""
+    """Derivatives of a chunk at `unknowns` (n_robots, n_q): at rest, or in a step of `run` from the motion
+    in `batch`."""
     work, command, jump = one_task(every, 0), run.command[0], run.lanes[0, 0]
     gather_all(robots, batch, command, work)
     for w in range(W):

@@ -34,8 +34,8 @@ from .motion import ModalMotion
 
 
 class ModalPieces(NamedTuple):
-    """How the segments of a batch are cut into pieces, and what else modes need of a robot. The robot axis
-    is 1 or n_robots."""
+    """Pieces into which the segments of a batch are cut, and further data of robots for modes. The robot
+    axis is 1 or n_robots."""
 
     segment: Ints
     """(n_pieces,) that a piece is extent of."""

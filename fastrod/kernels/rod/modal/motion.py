@@ -23,7 +23,7 @@ NODE_VECTORS = 12
 
 
 class ModalMotion(NamedTuple):
-    """What robots in motion remember from one step to the next. `n` numbers have inertia: those of the nodes,
+    """Memory of robots in motion from one step to the next. `n` numbers have inertia: those of the nodes,
     piece after piece, then the positions of the stations."""
 
     q: Floats
@@ -154,7 +154,7 @@ def n_lumps(motion: ModalMotion, work: ModalWork) -> int:
 
 @kernel
 def curvature_counted_from(b: ModalBasis, work: ModalWork) -> None:
-    """What the rate of u - u* at the Gauss points is counted from."""
+    """Set the origin of the rate of u - u* at the Gauss points."""
     n_modes = b.component.shape[0]
     for p in range(work.piece.shape[0]):
         for i in range(b.width.shape[0]):
@@ -269,8 +269,8 @@ def base_soon(robots: Ints, motion: ModalMotion, s: Scheme, dt: float, base: Lan
 def note_accelerations(
     robots: Ints, n_robots: int, motion: ModalMotion, s: Scheme, jump: Lanes, work: ModalWork
 ) -> None:
-    """Of robots that have jumped: the accelerations by a step of BDF1 that was too short to move them, as
-    those with which generalized-alpha begins."""
+    """Note the accelerations of robots that have jumped: the accelerations by a step of BDF1 that was too
+    short to move them, as those with which generalized-alpha begins."""
     for w in range(n_robots):
         if jump[w] <= 0.0:
             continue

@@ -49,9 +49,9 @@ SMALLEST_SIGMA, FIRST_SIGMA, LARGEST_SIGMA = 1e-4, 0.1, 1e8
 LONGEST_STEP = 1.0
 """Change of a piece's bend, of one mode [rad], or of strain by a fifth of it."""
 ROUNDING = 1e-12
-"""Of the energies: below it a rise is none."""
+"""Rounding error of the energies: below it a rise is none."""
 TINY = 1e-3
-"""Of the tolerance: after so small a step it does not matter which tendons it slackened."""
+"""Smallest fraction of the tolerance: after so small a step it does not matter which tendons it slackened."""
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""What a chunk of modes shows: cross-sections at even arclengths, energies, the wrench on the base."""
+"""Output of a chunk of modes: cross-sections at even arclengths, energies, the wrench on the base."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from .tendons import path
 
 
 class ModalSamples(NamedTuple):
-    """Where the cross-sections are that are shown: the same fractions of every robot."""
+    """Positions of the cross-sections that are shown: the same fractions of every robot."""
 
     piece: Ints
     """(n_points,)"""
@@ -58,7 +58,7 @@ class ModalSamples(NamedTuple):
 
 
 class MotionShape(NamedTuple):
-    """What a rod in motion has beside its shape; arrays of length 0 are not wanted."""
+    """Shape data of a rod in motion beside its shape at rest; arrays of length 0 are not wanted."""
 
     velocity: Floats
     """(n_robots, n_points, 3) world [m/s]."""
@@ -71,7 +71,7 @@ class MotionShape(NamedTuple):
 
 
 class ModalOutput(NamedTuple):
-    """What a pass writes; arrays of length 0 are not wanted."""
+    """Output of a pass; arrays of length 0 are not wanted."""
 
     samples: ModalSamples
     shape: RodShape
@@ -250,7 +250,7 @@ def show_chunk(robots: Ints, n_robots: int, batch: ModalBatch, output: ModalOutp
 
 @inline
 def arclength(m: int, w: int, samples: ModalSamples, batch: ModalBatch, work: ModalWork) -> float:
-    """Of cross-section m [m], without stretch."""
+    """Arclength of cross-section m [m], without stretch."""
     pieces, before = batch.pieces, 0.0
     for p in range(samples.piece[m]):
         before += read(work.piece[p], P_L, w)

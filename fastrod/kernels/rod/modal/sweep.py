@@ -1,4 +1,4 @@
-"""From base to tip: the rod of given curvature modes, and the motion of its nodes by each mode.
+"""Sweep from base to tip: the rod of given curvature modes, and the motion of its nodes by each mode.
 
 Over an interval of length h with curvature u_1, u_2 at its Gauss points the rotation grows by exp of
 o = h/2 (u_1 + u_2) + k u_1 x u_2, k = sqrt(3)/12 h^2: Magnus' series for R' = R [u]x to fourth order

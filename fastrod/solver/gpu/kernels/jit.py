@@ -1,4 +1,4 @@
-"""How kernels are compiled for a GPU: as functions of the device, pasted into the one kernel that Python
+"""Compilation of kernels for a GPU: as functions of the device, pasted into the one kernel that Python
 launches."""
 
 from __future__ import annotations
