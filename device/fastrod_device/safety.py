@@ -252,7 +252,7 @@ class Supervisor:
         with self._lock:
             if self.state not in (SafetyState.READY, SafetyState.RUNNING):
                 return None
-            sentence = f"nobody watches the robot any more while it is {self.state.value}."
+            sentence = f"no page is open, or none answers, while the robot is {self.state.value}."
             new = self._latch([Fault(kind="nobody watches", sentence=sentence, t=now)])
         self._send(new)
         return new

@@ -15,7 +15,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import matplotlib as mpl
+import matplotlib.image
 import mkdocs_gen_files
 import numpy as np
 
@@ -344,11 +346,28 @@ def environments() -> None:
 
     text = [(ROOT / "gym_envs/README.md").read_text("utf-8"), "## Every environment"]
     for name in names():
+        with mkdocs_gen_files.open(f"environments/{name}.png", "wb") as picture:
+            picture.write(_pictured(name))
         page = describe(name, timed=False)
-        text += [f"### {name}", "```text", page, "```"]
+        text += [f"### {name}", f"![{name} some steps on](environments/{name}.png)"]
+        text += ["```text", page, "```"]
     body = "\n\n".join(text).replace("```text\n\n", "```text\n").replace("\n\n```", "\n```")
     body = re.sub(r"\]\(\.\./([^)#\s]+)", lambda m: f"]({PAGES[m[1]]}", body)
     write("environments.md", body)
+
+
+def _pictured(name: str) -> bytes:
+    """PNG of an environment, some random steps into an episode."""
+    env = gymnasium.make(f"fastrod/{name}-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(5):
+        if env.step(env.action_space.sample())[2]:
+            env.reset(seed=1)
+    out = io.BytesIO()
+    mpl.image.imsave(out, env.render(), format="png")
+    env.close()
+    return out.getvalue()
 
 
 def api() -> None:

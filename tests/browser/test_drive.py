@@ -117,7 +117,7 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
 def test_another_scene_is_picked_in_the_page(app: App, window: Windows) -> None:
     app.open("prototype")
     seen = window(app.address)
-    seen.pick("Scene", "tdcr_a")
+    seen.pick("Show", "Robot · TDCR A")
     assert seen.until(lambda: app.page is not None and app.page.title == "tdcr_a")
     assert seen.until(lambda: seen.page.get_by_text("All bend x [°]").count() == 1)
     assert seen.errors == []

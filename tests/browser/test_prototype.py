@@ -250,7 +250,7 @@ def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     there = bed.link.change()
     assert there[0] > 0.0075 * np.radians(-60.0)  # it had not arrived
     other.go(bed.app.address)
-    assert bed.says(other, "nobody watches the robot any more")
+    assert bed.says(other, "no page is open, or none answers")
     bed.bend(other, "End")
     assert bed.stands(other)
     assert_allclose(bed.link.change(), there, atol=STANDS)

@@ -18,7 +18,7 @@ from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod_scenes.scene import names
 from fastrod_viewer.canvas import Canvas
-from fastrod_viewer.catalogue import catalogue, open_world
+from fastrod_viewer.catalogue import labels, open_world
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.holder import Holder
 from fastrod_viewer.holder_panel import HolderPanels
@@ -34,6 +34,7 @@ FIRST = "five_segment_reacher"
 """Shown unless something is named."""
 MOST = 1024
 """Robots in a grid."""
+_SOON = 0.5  # s in which a command that shows nothing says so alone
 _BRAND = (37, 99, 235)
 
 
@@ -64,7 +65,9 @@ class App:
         gui.set_panel_label("fastrod")
         gui.main_panel.dock_left()
         self.canvas = Canvas(self.server)
-        self._known = catalogue()
+        self.known = labels() | {DEMO_LOG: f"Log · {plain(DEMO_LOG)}"}
+        """Name -> label in the picker."""
+        self._current = FIRST
         self._picker: Any = None
         self.holder = Holder(lambda: self.watch.present(), changed=self._show_holder, moved=self._passed_on)
         self._panels = HolderPanels(self.server, self.holder)
@@ -143,31 +146,33 @@ class App:
             raise
 
     def _show_picker(self, current: str) -> None:
-        names = [*self._known, DEMO_LOG]
-        if current not in names:
-            names.insert(0, current)
+        self._current, label = current, self.known.get(current, current)
+        labels = tuple(self.known.values())
+        if current not in self.known:
+            labels = (label, *labels)
         if self._picker is None:
-            self._picker = self.server.gui.add_dropdown(
-                "Scene", tuple(names), initial_value=current, order=-1.0
-            )
+            self._picker = self.server.gui.add_dropdown("Show", labels, initial_value=label, order=-1.0)
             self._picker.on_update(self._picked)
-        elif self._picker.value != current or tuple(self._picker.options) != tuple(names):
-            self._picker.options = tuple(names)
-            self._picker.value = current
+        elif self._picker.value != label or tuple(self._picker.options) != labels:
+            self._picker.options = labels
+            self._picker.value = label
 
     def _picked(self, event: Any) -> None:
         if event.client_id is None:
             return
-        name = event.target.value
-        before = self.page.title if self.page is not None else name
+        label = event.target.value
+        name = next((name for name, known in self.known.items() if known == label), label)
+        before = self.known.get(self._current, self._current)
         if not self._panels.may(event):
             self._picker.value = before
             return
-        note = event.client.add_notification(f"Opening {name}", "", loading=True, with_close_button=False)
+        note = event.client.add_notification(
+            f"Opening {plain(name)}", "", loading=True, with_close_button=False
+        )
         try:
             self.open(name)
         except FastrodError as error:
-            notify(event.client, f"{name} cannot be shown", str(error), failed=True)
+            notify(event.client, f"{plain(name)} cannot be shown", str(error), failed=True)
             self._picker.value = before
         finally:
             note.remove()
@@ -206,6 +211,8 @@ class App:
         self.holder.tick()
         page = self.page
         if page is not None:
+            for client in self.server.get_clients().values():
+                page.sight.correct(client)
             page.tick()
 
     def _lost(self, client: int, left: int) -> None:
@@ -218,7 +225,7 @@ class App:
             self.say("No page is open, or none answers; nothing is commanded until one does.")
 
 
-DEMO_LOG = "measured log (demo)"
+DEMO_LOG = "demo_log"
 """The log that ships with the package, in the picker."""
 
 
@@ -334,11 +341,19 @@ def view(
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
-        shown = (
-            found_in_motion(what, n_robots, line_density=line_density, dt=dt)
-            if dynamics
-            else found(what, robot, n_robots)
-        )
+        line = f"{_title(what)}: {app.address} (Ctrl+C ends it)"
+        address = threading.Timer(_SOON, print, (line,), {"flush": True})
+        address.start()  # a first world compiles for half a minute
+        try:
+            shown = (
+                found_in_motion(what, n_robots, line_density=line_density, dt=dt)
+                if dynamics
+                else found(what, robot, n_robots)
+            )
+        except BaseException:
+            address.cancel()
+            raise
+        address.join()
         if open_browser:
             app.served.open_browser()
         app.open(shown, link=link, script=script)
@@ -347,5 +362,4 @@ def view(
                 f"Other machines can open this page, too, at {app.served.elsewhere} and whoever has this "
                 "address can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
-        print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()

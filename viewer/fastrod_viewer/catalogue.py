@@ -11,6 +11,7 @@ from fastrod.errors import UnknownNameError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot, robot_names
 from fastrod_scenes.scene import HostedScene, MujocoScene, RodScene, load, names
+from fastrod_viewer.page import plain
 from fastrod_viewer.robots import about
 
 if TYPE_CHECKING:
@@ -63,6 +64,16 @@ def catalogue() -> dict[str, str]:
         **HOSTED_SCENES,
         **MUJOCO_SCENES,
     }
+
+
+def labels() -> dict[str, str]:
+    """Name -> label in a picker, in the order of `catalogue`: the group, then a plain name.
+
+    >>> labels()["airway"], labels()["tdcr_a"]
+    ('Contact · Airway', 'Robot · TDCR A')
+    """
+    groups = {"Robot": robot_names(), "Contact": ROD_SCENES, "Rigid host": {**HOSTED_SCENES, **MUJOCO_SCENES}}
+    return {name: f"{group} · {plain(name)}" for group, members in groups.items() for name in members}
 
 
 def open_world(name: str | Path | Robot) -> World:

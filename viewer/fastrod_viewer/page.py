@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _LARGEST_PICTURE = 1920, 1080
 _FIELD = 0.75  # rad, vertical
+_SPELT = {"tdcr": "TDCR", "a": "A", "b": "B", "ethz": "ETH Zurich", "mujoco": "MuJoCo", "ur5": "UR5"}
 _WAIT = 20.0  # s for a page to draw its picture
 
 
@@ -67,10 +68,15 @@ class PageView:
     def show(self, camera: Any, *, upright: bool = False) -> None:
         """Point a camera at it; in an upright window it stands in the upper half, above the controls."""
         away = np.array([0.62, -0.70, 0.30])
-        distance = (2.4 if upright else 1.12) * self.size / np.sin(0.5 * _FIELD)
-        at = self.middle - np.array([0.0, 0.0, 0.95 * self.size if upright else 0.0])
+        distance = (2.6 if upright else 1.12) * self.size / np.sin(0.5 * _FIELD)
+        at = self.middle - np.array([0.0, 0.0, 1.4 * self.size if upright else 0.0])
         camera.near, camera.far, camera.fov = 0.02 * self.size, 60.0 * self.size, _FIELD
         camera.position, camera.look_at = at + distance * away / np.linalg.norm(away), at
+
+    def correct(self, client: Any) -> None:
+        """Show it again to an upright window that looks as a wide one does: its first look came late."""
+        if is_upright(client) and np.allclose(client.camera.look_at, self.middle, atol=1e-3 * self.size):
+            self.show(client.camera, upright=True)
 
 
 def stand_back(server: viser.ViserServer, sight: PageView) -> None:
@@ -101,11 +107,11 @@ def picture(client: Any) -> bytes:
 def plain(name: str) -> str:
     """A name as one reads it.
 
-    >>> plain("five_segment_reacher")
-    'Five segment reacher'
+    >>> plain("five_segment_reacher"), plain("tdcr_a")
+    ('Five segment reacher', 'TDCR A')
     """
-    words = name.replace("_", " ")
-    return words[:1].upper() + words[1:]
+    words = [_SPELT.get(word, word) for word in name.split("_")]
+    return " ".join([words[0][:1].upper() + words[0][1:], *words[1:]])
 
 
 def heading(title: str, about: str, hint: str) -> str:

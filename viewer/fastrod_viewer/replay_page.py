@@ -12,7 +12,7 @@ from fastrod.errors import FastrodError
 from fastrod.types import Floats
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.export import wrap
-from fastrod_viewer.page import ViewerPage, facts, notify, picture, send, stand_back
+from fastrod_viewer.page import ViewerPage, facts, heading, notify, picture, plain, send, stand_back
 from fastrod_viewer.palette import MEASURED, css
 from fastrod_viewer.playback import Playback, identify
 from fastrod_viewer.replay_drawing import BOTH, ReplayDrawing
@@ -29,7 +29,9 @@ _SPEEDS = {"¼ ×": 0.25, "1 ×": 1.0, "4 ×": 4.0, "16 ×": 16.0}
 _FACTORS = ("1", "2", "5", "10", "20", "50")
 _SEEN = 0.15  # of the robot's length: the usual residual is drawn about so long
 _EXPORTED = 240  # frames of an exported page
-_FIND = "What does the model lack?"
+_FIND = "Find the missing effect"
+_ABOUT = "A measured log beside the prediction of the model; the arrow is the residual at the tip."
+_HINT = "Move the time, or choose another model."
 
 
 @final
@@ -135,11 +137,10 @@ class ReplayPage(ViewerPage):
         self.canvas.clear()
 
     def _build(self) -> None:
-        import viser
-
         gui, playback = self.server.gui, self.playback
         panel, aside, below = gui.add_folder(None), gui.add_panel(), gui.add_panel()
         with panel:
+            gui.add_html(heading(plain(self.title), _ABOUT, _HINT))
             self.figures = gui.add_html("")
             duration = max(playback.duration, 1e-3)
             step = float(f"{max(duration / 2000.0, 1e-3):.1g}")
@@ -147,7 +148,7 @@ class ReplayPage(ViewerPage):
                 "Time [s]", 0.0, float(np.ceil(duration / step) * step), step, 0.0
             )
             self.slider.on_update(self._scrub)
-            self.play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint="Key: space")
+            self.play = gui.add_button("Pause", icon=_icon(True), hint="Key: space")
             self.play.on_click(lambda _: self._toggle())
             gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="1 ×").on_update(
                 lambda e: self._set(speed=_SPEEDS[e.target.value])
@@ -204,8 +205,9 @@ class ReplayPage(ViewerPage):
         )
         scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.08 * most))}
         axes = (uplot.Axis(label="time [s]"), uplot.Axis(label="mm"))
+        legend = uplot.Legend(live=False)  # names and colours; a value only where the mouse is says nothing
         return self.server.gui.add_uplot(
-            self._plotted(0), tuple(series), axes=axes, scales=scales, height=170
+            self._plotted(0), tuple(series), axes=axes, scales=scales, legend=legend, height=170
         )
 
     def _plotted(self, frame: int) -> tuple[Floats, ...]:
@@ -290,9 +292,9 @@ class ReplayPage(ViewerPage):
                     self._show(now)
 
     def _show(self, now: float) -> None:
-        label = "Pause" if self._playing else "Play"
+        label = "Pause" if self._playing else "Play" if self._time < self.playback.duration else "Play again"
         if self.play.label != label:
-            self.play.label = label
+            self.play.label, self.play.icon = label, _icon(self._playing)
         frame = self.playback.at(self._time)
         if frame == self.frame:
             return
@@ -321,3 +323,10 @@ class ReplayPage(ViewerPage):
         with self.server.atomic():
             self.drawing.draw(frame, self.choice, float(self._magnify))
         self.server.flush()
+
+
+def _icon(playing: bool) -> Any:
+    """Return the icon of the button that pauses or plays."""
+    import viser
+
+    return viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY

@@ -25,7 +25,8 @@ _DRIVES = {
 def about(robot: Robot) -> str:
     """One sentence on a robot.
 
-    >>> about(load_robot("prototype"))
+    >>> import fastrod
+    >>> about(fastrod.load_robot("prototype"))
     'One segment, 0.07 m, driven by the lengths of its tendons.'
     """
     n = robot.n_segments
