@@ -37,6 +37,7 @@ PAGES = {
     "device/README.md": "prototype.md",
     "scenes/README.md": "scenes.md",
     "perf/README.md": "figures.md",
+    "perf/COMPARISON.md": "comparison.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }
