@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from fastrod.identification.log.replay import replay
     from fastrod.logs.runlog import RunLog, read_log, write_log
     from fastrod.simulator import Simulator
-    from fastrod.solver.modal import Modes
-    from fastrod.solver.state import Observer, Pose, State
+    from fastrod.solver.options import Modal, Modes, Observer
+    from fastrod.solver.state import Pose, State
     from fastrod.solver.tape import Tips
     from fastrod_viewer.live import view
 
 __all__ = [
     "ContactScene",
     "Lump",
+    "Modal",
     "Modes",
     "Observer",
     "Pose",
@@ -49,8 +50,9 @@ __all__ = [
 ]
 _HOME = {
     "ContactScene": "fastrod.contact.scene",
-    "Modes": "fastrod.solver.modal",
-    "Observer": "fastrod.solver.state",
+    "Modal": "fastrod.solver.options",
+    "Modes": "fastrod.solver.options",
+    "Observer": "fastrod.solver.options",
     "Pose": "fastrod.solver.state",
     "Rod": "fastrod.hosts.rod",
     "RunLog": "fastrod.logs.runlog",

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.contact import queries
-from fastrod.contact.engine import Engine
-from fastrod.contact.frames import blended
-from fastrod.contact.scene import ContactScene
-from fastrod.contact.step import COLD_ITERATIONS, ContactStep
 from fastrod.effects.executor import SensedPoses, from_base
-from fastrod.errors import InputError, Problem
+from fastrod.errors import InputError
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
 from fastrod.solver import options
-from fastrod.solver.contact_solver import RodSolver
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.inputs import (
     Inputs,
@@ -29,20 +23,23 @@ from fastrod.solver.inputs import (
     named_inputs,
     robot_mask,
 )
-from fastrod.solver.modal import Modes
-from fastrod.solver.motion import Motions
-from fastrod.solver.recovery import Boundary, overloaded
-from fastrod.solver.response import stretch
-from fastrod.solver.state import Observer, Pose, State, check_on_robot
-from fastrod.solver.statics import DIVERGED
-from fastrod.solver.stepper import unloaded
+from fastrod.solver.observer import ObserverSolver
+from fastrod.solver.options import Modal, Observer, SchemeName, SolverName
+from fastrod.solver.protocol import How, Solver
+from fastrod.solver.robots import RobotBatch
+from fastrod.solver.state import Pose, State, check_on_robot
 from fastrod.threads import one_blas_thread
 from fastrod.types import Floats, Ports
 
-_AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
+if TYPE_CHECKING:
+    from fastrod.contact.engine import Engine
+    from fastrod.contact.queries import Hits
+    from fastrod.contact.scene import ContactScene
+    from fastrod.solver.motion import ModalRods
+    from fastrod.solver.tape import Cost, Gradient, Tape
 
 
-class Simulator(Motions):
+class Simulator(RobotBatch):
     """Many tendon-driven continuum robots at once.
 
     >>> import fastrod
@@ -62,73 +59,78 @@ class Simulator(Motions):
         points_per_segment: int = 20,
         *,
         outputs: Literal["full", "tip"] = "full",
-        observer: Observer | None = None,
-        threads: int | None = None,
-        contact: ContactScene | None = None,
-        kept_jacobian_tolerance: float = 0.0,
-        feel_contact: bool = True,
-        device: devices.Device = "cpu",
-        recover: bool = True,
-        solver: Literal["observer", "modal"] | None = None,
+        solver: SolverName | Observer | Modal | None = None,
         dynamics: bool = False,
-        scheme: Literal["bdf1", "bdf2", "generalized_alpha"] = "generalized_alpha",
-        rho: float = 0.5,
-        modes: Modes | None = None,
+        scheme: SchemeName = Modal.scheme,
+        contact: ContactScene | None = None,
+        feel_contact: bool = True,
+        recover: bool = True,
+        threads: int | None = None,
+        device: devices.Device = "cpu",
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
         `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times
         as many nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a
         five-segment robot.
-        `threads` defaults to numba's. `contact` is what the rods may touch; without it
-        they pass through everything. Without `feel_contact` they do so all the same, and the scene is for
-        `clearance`, `swept_clearance` and `ray_cast` alone. While a robot's last residual is below
-        `kept_jacobian_tolerance` [m] (and it feels no contact) a step corrects the boundary by the Jacobian
-        that it has (chord Newton), without new sensitivities: a third of the time, and the observer lags by
-        about so much. Without `recover` a robot whose pass diverges in a step is
-        lost at once: a step then ends after its one pass, where the search for a shape that does not exist
-        takes some thousand.
 
-        With `device="cuda"` the passes run on an NVIDIA GPU, one thread a robot, from the same source:
-        numbers agree to rounding. The memory of the observer stays there; a step sends the inputs that
-        changed and brings back what `outputs` asks for, so for large batches ask for "tip". Everything else
-        is done on the CPU, as are the Newton steps of `settle`. Rods that feel contact need the CPU.
+        `solver` is a `fastrod.Observer`, one forward integration a step (the default), or a `fastrod.Modal`:
+        rods of curvature modes, which robots with axial or shear stiffness or with inertia take; "observer"
+        and "modal" stand for both as they are. `dynamics=True` and a `scheme` stand for
+        `Modal(dynamics=True, scheme=...)`: a step moves a robot on by `dt`, and every segment needs a
+        line_density. Without `recover` a robot whose pass diverges in a step is lost at once: a step then
+        ends after its one pass, where the search for a shape that does not exist takes some thousand.
 
-        `solver` is "observer", one forward integration a step (the default), or "modal": rods of curvature
-        modes, which robots with axial or shear stiffness or with `dynamics` take. Then a step brings a robot
-        to rest on its inputs, or with `dynamics` moves it on by `dt`: every segment needs a line_density.
-        `scheme` is "generalized_alpha" (second order, `rho` from 0 to 0.9 damps high frequencies), "bdf2" or
-        "bdf1"; `modes` says how finely a segment is resolved. Not with contact, a GPU or an observer.
+        `contact` is what the rods may touch; without it they pass through everything. Without `feel_contact`
+        they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone.
+        Rods of modes feel none yet.
+
+        `threads` defaults to numba's. With `device="cuda"` the observer's passes run on an NVIDIA GPU, one
+        thread a robot, from the same source: numbers agree to rounding. The memory of the observer stays
+        there; a step sends the inputs that changed and brings back what `outputs` asks for, so for large
+        batches ask for "tip". Everything else is done on the CPU, as are the Newton steps of `settle`.
 
         Raises `InputError` (also where there is no GPU), `RobotError`, `UnknownNameError`.
         """
         robots, n_robots = options.checked_robots(robot, n_robots)
-        options.check_options(points_per_segment, dt, outputs, kept_jacobian_tolerance)
-        self.solver = options.check_solver(robots, solver, bool(dynamics), scheme, rho, modes)
-        """Solver of the rods: "observer" or "modal"."""
+        options.check_options(points_per_segment, dt, outputs)
+        how = options.solver_of(robots, solver, dynamics, scheme)
         self.device = devices.checked(device)
         """Device on which the passes run."""
-        options.check_fellows(self.solver, observer, contact, feel_contact, device, kept_jacobian_tolerance)
-        super().__init__(
-            robots,
-            n_robots,
-            float(dt),
-            int(points_per_segment),
-            outputs=outputs,
-            observer=observer,
-            threads=options.checked_threads(threads),
-            device=self.device,
-            kept_jacobian_tolerance=float(kept_jacobian_tolerance),
-            recover=bool(recover),
-        )
-        if self.solver == "modal":
-            self._use_modes(bool(dynamics), scheme, rho, modes)
+        options.check_fellows(how, contact, feel_contact, device)
+        super().__init__(robots, n_robots, float(dt), int(points_per_segment), outputs)
         self.contact: ContactScene | None = contact
         """Scene that the rods may touch."""
+        self.dynamics = isinstance(how, Modal) and how.dynamics
+        """Whether the rods have inertia: a step moves them on by `dt`."""
+        shared: Any = {"dt": self.dt, "outputs": outputs, "threads": options.checked_threads(threads)}
         if contact is not None:
+            from fastrod.contact.engine import Engine
+
             rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
-            self._engine = Engine(contact, rods, self._plain.length, self.n_points, self._passes.threads)
+            self._engine = Engine(contact, rods, self._plain.length, self.n_points, shared["threads"])
             self._felt = self._engine if feel_contact else None
+        self._rods = self._solver_of(how, shared, recover)
+
+    def _solver_of(self, how: Observer | Modal, shared: Any, recover: bool) -> Solver:
+        """The rods, solved as `how` says; modules of modes and of contact are imported for those who use
+        them."""
+        if isinstance(how, Modal):
+            from fastrod.solver.motion import ModalRods
+
+            return ModalRods(how, self.robots, self._layout, self._plain, self.n_robots, **shared)
+        shared |= {"device": self.device, "recover": bool(recover)}
+        given = how, self._layout, self._plain, self.n_robots
+        if self._felt is None:
+            return ObserverSolver(*given, **shared)
+        from fastrod.solver.contact_solver import ContactObserver
+
+        return ContactObserver(self._felt, *given, **shared)
+
+    @property
+    def solver(self) -> SolverName:
+        """Kind of the solver: "observer" or "modal"."""
+        return "observer" if isinstance(self._rods, ObserverSolver) else "modal"
 
     def __repr__(self) -> str:
         touched = "" if self.contact is None else ", ".join(self.contact.names) or "rods alone"
@@ -212,12 +214,9 @@ class Simulator(Motions):
             base_pose,
             gravity,
         )
-        self._refuse_follower_line(follower_line_force)
-        if self._felt is not None:
-            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
-        self._spend(passes, estimate_error)
-        self._free_bases(inverse_inertia)
-        return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
+        how = How(self.dt, passes, estimate_error, inverse_inertia, derive)
+        self._rods.accept(given, how)
+        return self._step(given, how, self._moved_obstacles(obstacle_pose, obstacle_velocity))
 
     @named_inputs
     @one_blas_thread
@@ -268,20 +267,19 @@ class Simulator(Motions):
             base_pose,
             gravity,
         )
-        self._refuse_follower_line(follower_line_force)
-        if self._felt is not None:
-            if rows is not None:
-                raise InputError(
-                    "settle with rows is for simulators without a contact scene; settle all, "
-                    "or restore a snapshot's rows."
-                )
-            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
+        self._rods.accept(given, None)
+        if self._felt is not None and rows is not None:
+            raise InputError(
+                "settle with rows is for simulators without a contact scene; settle all, "
+                "or restore a snapshot's rows."
+            )
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         only = None if rows is None else robot_mask(rows, self.n_robots)
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
         state = self._settle(ports, read, tolerance, only)
-        return self._balanced(given, state, tolerance, only) if self._chain.follows else state
+        follows = self._chain.follows and self._felt is None
+        return self._balanced(given, state, tolerance, only) if follows else state
 
     def _at_rest(self) -> tuple[Floats | None, Floats | None]:
         """Lengths of tendons at rest (n_robots or 1, n_tendons) [m], or no tension, as the robots are driven;
@@ -293,66 +291,75 @@ class Simulator(Motions):
             return np.stack([robot.rest_tendon_length for robot in self.robots]), None
         return None, None
 
-    def _refuse_follower_line(self, force: ArrayLike | None) -> None:
-        if force is not None and self.solver != "modal":
-            raise InputError(
-                "follower_line_force was given, but the observer has line forces of the world only; take "
-                "solver='modal'."
-            )
-
-    def _contact_step(
-        self,
-        engine: Engine,
-        given: Inputs,
-        pose: Mapping[str, ArrayLike] | None,
-        velocity: Mapping[str, ArrayLike] | None,
-        tolerance: float | None,
-    ) -> State:
-        """A step (`tolerance` None), or `settle`, with a contact scene."""
-        poses = engine.scene.moved(engine.poses, pose, self.n_robots)
-        velocities = engine.scene.velocities(velocity, self.n_robots)
-        start = self._ports
-        ports, rows = self._read(given)
-        if start is not None:
-            stretch(self._passes, rows, ports.extension - start.extension)
-        engine.given_arclength, engine.given_force = self._reader.loads
-        engine.move(poses, velocities, self.dt)
-        solver = RodSolver(
-            boundary=self._passes,
-            warm=self._warm,
-            tolerance=tolerance,
-            recovery=Boundary(self._passes) if self.recover else None,
-            process=self.observer.process_noise * self.dt,
-            noise=self.observer.measurement_noise / self.dt,
-            used=np.zeros(self.n_robots, np.int64),
-        )
-        shape, passes = self._passes.new_shape("full", True), solver.used
-        ok, done = ContactStep(
-            engine=engine,
-            solver=solver,
-            shape=shape,
-            end=ports,
-            tolerance=tolerance or _AT_REST,
-            most=engine.scene.max_iterations if tolerance is None else COLD_ITERATIONS,
-        ).run(rows, self._warm, start, unloaded(ports, self._layout, self._passes.params))
-        for i in rows[~ok[rows]]:
-            if engine.continued[i] and not overloaded(self._passes, ports, int(i)):
-                why = engine.why(int(i), float(done[i]))
-            else:
-                why = self._sentence(DIVERGED, Problem.DIVERGED, ports, shape, int(i))
-            self._reader.problems.setdefault(int(i), why)
-        # a cold robot has no last inputs to go on from: it begins anew
-        gone = np.isin(self._all, rows) & ~ok
-        held = gone & (engine.continued | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
-        if held.any() and start is not None:
-            ports = blended(start, ports, done)
-        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.continued)), ports)
-        lost = np.flatnonzero(gone & ~(held & engine.continued))
-        state = self._finish(
-            ports, shape, ok, np.where(ok, passes, -1), "contact", Problem.CONTACT_STUCK, lost
-        )
-        self._warm[held] = True  # it stands where it came to, and goes on from there
+    def _full(self, what: str) -> State:
+        state, _ = self._last(what)
+        if self.outputs != "full":
+            raise InputError(f"{what} needs Simulator(..., outputs='full'); this one keeps the tip only.")
         return state
+
+    def _modal(self, what: str) -> ModalRods:
+        from fastrod.solver.motion import ModalRods
+
+        if not isinstance(self._rods, ModalRods):
+            raise InputError(f"{what} needs rods of modes; give Simulator(robot, solver='modal').")
+        return self._rods
+
+    def _in_motion(self, what: str) -> ModalRods:
+        """Rods that have inertia, after their first step."""
+        self._last(what)
+        if not self.dynamics:
+            needs = "inertia" if what == "frequencies" else "rods with inertia"
+            raise InputError(f"{what} needs {needs}; give Simulator(robot, dynamics=True).")
+        return self._modal(what)
+
+    def set_in_motion(self, base_twist: ArrayLike, rows: ArrayLike | None = None) -> None:
+        """Let robots that were brought to rest move on with their bases as rigid bodies, at `base_twist` (6,)
+        or (n_robots, 6): velocity of the base point [m/s] and angular velocity [rad/s], world. `rows`:
+        indices or a mask, all without it. Raises `InputError` without `dynamics`, and before the first
+        state."""
+        rods = self._in_motion("set_in_motion")
+        some = self._all if rows is None else np.flatnonzero(robot_mask(rows, self.n_robots))
+        rods.set_in_motion(base_twist, some[self._warm[some]])
+
+    def momentum(self) -> Floats:
+        """(n_robots, 6) linear [kg m/s], then angular momentum about the origin [kg m^2/s], of rods in
+        motion, world. Raises `InputError` without `dynamics`, and before the first state."""
+        rods = self._in_motion("momentum")
+        return rods.momentum(self._acting(self._last("momentum")[1]), self._warm)
+
+    def apparent_stiffness(self) -> Floats:
+        """(n_robots, 6, 6) by how much force and moment about the base point, which the rod exerts on its
+        base at the end of the last step, fall per displacement [m] and rotation [rad] of the base there,
+        world: H_bb - H_bq H_qq^-1 H_qb, inertia and all, and half the moment's own rotation, by which it is
+        not symmetric. It is that of the shape before the last Newton step: to rounding with more `passes`.
+        Raises `InputError` but after a step with `inverse_inertia`; nan for robots that took none."""
+        state, _ = self._last("apparent_stiffness")
+        if not self.dynamics:
+            raise InputError("apparent_stiffness is of a step with inverse_inertia; give it to step.")
+        return self._modal("apparent_stiffness").apparent_stiffness(state)
+
+    def frequencies(self, count: int = 3) -> Floats:
+        """(n_robots, count) lowest natural frequencies [Hz] of small motions about the last state's shape,
+        which should be a rest, undamped. Raises `InputError` without rods of modes or a mass, and before the
+        first step."""
+        rods = self._in_motion("frequencies")
+        return rods.frequencies(count, self._acting(self._last("frequencies")[1]), self._warm)
+
+    def record(self) -> Tape:
+        """Record every call from now on, for its derivatives: `Tape.forward` and `adjoint`. A recorded
+        step ends when Newton's method does, and takes some times as long. `restore` and `replace` end the
+        recording. Raises `InputError` without rods of modes."""
+        return self._modal("record").record()
+
+    def adjoint(self, cost: Cost, parameters: Sequence[str] = (), inputs: Sequence[str] = ()) -> Gradient:
+        """Derivatives of `cost` of the tips' motion since `record()`, by the inputs of every call (without
+        names by `tendon_length`) and by numbers of the robots such as "segment.1.line_density"
+        (`Tape.adjoint`). Raises `InputError` where nothing is recorded, and for names that there are
+        not."""
+        tape = self._modal("adjoint").tape
+        if tape is None:
+            raise InputError("adjoint needs a recording; call record() before the first call of it.")
+        return tape.adjoint(cost, parameters, inputs or ("tendon_length",))
 
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
@@ -361,7 +368,9 @@ class Simulator(Motions):
         everywhere.
         """
         if self.solver == "modal":
-            return self._modal_shape(self._full("shape"), arclength)
+            from fastrod.solver.motion import pose_at
+
+            return pose_at(self._full("shape"), arclength)
         state, ports = self._full("shape"), self._last("shape")[1]
         s = arclengths(arclength, self.n_robots)
         check_on_robot(s, state)
@@ -369,14 +378,7 @@ class Simulator(Motions):
         found = Pose(*(np.full((*s.shape, *axes), np.nan) for axes in ((3,), (3, 3), (3,))))
         robot, query = np.nonzero(np.broadcast_to(np.isfinite(end), s.shape))
         between_nodes(
-            robot,
-            query,
-            np.array(s, order="C"),
-            self._passes.params,
-            ports,
-            self._layout,
-            state.as_shape(),
-            found,
+            robot, query, np.array(s, order="C"), self._params, ports, self._layout, state.as_shape(), found
         )
         return found
 
@@ -457,6 +459,8 @@ class Simulator(Motions):
         """(n_robots,) smallest gap between the robot's surface and the obstacle of this name, or anything
         that it may touch [m] (`contact.queries.clearance`). Raises `InputError` without a contact scene or a
         state, `UnknownNameError`."""
+        from fastrod.contact import queries
+
         return queries.clearance(self._contact("clearance"), self._full("clearance").as_shape(), obstacle)
 
     def swept_clearance(self, tolerance: float = 1e-5, rows: ArrayLike | None = None) -> Floats:
@@ -465,15 +469,19 @@ class Simulator(Motions):
         given. Raises `InputError` as `clearance`."""
         engine = self._contact("swept_clearance")
         check_positive("tolerance", tolerance, "m")
+        from fastrod.contact import queries
+
         now = self._full("swept_clearance").as_shape()
         before, poses = engine.at_last_step
         some = None if rows is None else robot_mask(rows, self.n_robots)
         return queries.swept_clearance(engine, now if before is None else before, poses, now, tolerance, some)
 
-    def ray_cast(self, origin: ArrayLike, direction: ArrayLike, longest: float = np.inf) -> queries.Hits:
+    def ray_cast(self, origin: ArrayLike, direction: ArrayLike, longest: float = np.inf) -> Hits:
         """Return what distance sensors see: rays (n_rays, 3) or (n_robots, n_rays, 3), world, against the
         obstacles where they are now, up to `longest` [m]. Raises `InputError` without a contact scene, on
         a wrong shape or a direction of length 0."""
+        from fastrod.contact import queries
+
         return queries.ray_cast(self._contact("ray_cast"), origin, direction, longest)
 
     def _moved_obstacles(

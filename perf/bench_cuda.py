@@ -12,6 +12,7 @@ import flops
 from cases import Case
 from fastrod import Simulator
 from fastrod.errors import InputError
+from fastrod.solver.boundary import new_shape
 from fastrod.solver.gpu.device import checked
 from fastrod.types import Ports
 from report import Measurement, Row, Section, bench, best, goal, note_progress, table
@@ -59,16 +60,16 @@ def points_of(key: str, n: int) -> int:
 
 def transferred(sim: Simulator) -> tuple[int, int]:
     """Bytes sent and fetched until now."""
-    runner = sim._passes._runner
+    runner = sim._rods.passes._runner
     return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
 
 def stages(sim: Simulator) -> dict[str, float]:
     """Seconds of the pass alone, on ports that are there; its extra cost on new ones; bringing its shape
     back."""
-    passes, ports, sending = sim._passes, sim._ports, Measurement()
+    passes, ports, sending = sim._rods.passes, sim._ports, Measurement()
     assert ports is not None
-    shape = passes.new_shape("tip", False)
+    shape = new_shape(passes.layout, passes.n_robots, "tip", False)
 
     def run(at: Ports) -> None:
         passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
@@ -145,14 +146,14 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     small = case_of(key, n)
     sim = Simulator(small.robot, n, points_per_segment=points, outputs="tip")
     sim.settle(**small.inputs(small.at(0, False)))
-    passes, ports = sim._passes, sim._ports
+    passes, ports = sim._rods.passes, sim._ports
     assert ports is not None
 
     def each(arrays: Any) -> float:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray) and len(a) == n > 1) / n
 
     moved = each(ports) + each(passes.params) + 2.0 * each(passes.peek()) + 8.0
-    moved += each(passes.new_shape("tip", False))
+    moved += each(new_shape(passes.layout, passes.n_robots, "tip", False))
     n_tendons, n_columns = len(passes.layout.tendon_segment), passes.n_columns(ports)
     scratch = scratch_size(n_tendons, passes.n_x, n_columns, passes.n_residuals(ports))
     bandwidth, peak, name = device_limits()

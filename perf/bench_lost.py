@@ -83,7 +83,7 @@ def _row(arrays: Any, i: int, n: int) -> Any:
 def _settled(simulator: Simulator, i: int, ports: Ports) -> bool:
     """Whether a new simulator settles on what the kernel was given for robot i, effects included."""
     fresh = _anew(simulator, i, effects=())
-    params = _row(simulator._passes.params, i, simulator.n_robots)
+    params = _row(simulator._params, i, simulator.n_robots)
     return bool(fresh.settle_ports(_row(ports, i, simulator.n_robots), params, _TOLERANCE).ok[0])
 
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from appendix_j import Peer, Rung, Solve
 from cases import Array
-from fastrod import Robot, Segment, Simulator
-from fastrod.solver.modal import Modes
+from fastrod import Modal, Modes, Robot, Segment, Simulator
 
 LENGTH, BENDING, DENSITY, RADIUS = 0.1, 0.0022, 0.1, 2e-3
 """m, EI in N m^2, kg/m, and the radius of the round section [m], which gives the rotary inertia."""
@@ -49,7 +48,8 @@ def _step(modes: Modes, dt: float) -> Iterator[Solve]:
     def solve(force: Array) -> Array:
         n = len(force)
         if n not in sims:
-            options = {"dynamics": True, "rho": 0.9, "modes": modes, "outputs": "tip", "threads": 1}
+            how = Modal(dynamics=True, rho=0.9, modes=modes)
+            options = {"solver": how, "outputs": "tip", "threads": 1}
             sim = Simulator(robot(), n, EVERY / every, 2, **options)  # type: ignore[arg-type]
             sim.settle()
             sims[n] = sim, sim.snapshot()

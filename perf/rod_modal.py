@@ -11,8 +11,7 @@ import numpy as np
 
 import cases
 from cases import Array, Case, Pose
-from fastrod import Simulator, State
-from fastrod.solver.modal import Modes
+from fastrod import Modal, Modes, Simulator, State
 from report import Measurement, Row, Section, note_progress, table, thread_counts
 
 COST = {"prototype": 1.1, "reacher": 0.7}
@@ -48,9 +47,9 @@ DEFAULT = replace(OBSERVER, points=20)
 KINDS: Sequence[Kind] = (
     OBSERVER,
     DEFAULT,
-    Kind("modal, at rest, (6, 4)", {"solver": "modal", "modes": _SIX}),
-    Kind("modal, at rest, (4, 2)", {"solver": "modal", "modes": _FOUR}, has_goal=True),
-    Kind("modal, in motion, (4, 2)", {"dynamics": True, "modes": _FOUR}, has_goal=True),
+    Kind("modal, at rest, (6, 4)", {"solver": Modal(modes=_SIX)}),
+    Kind("modal, at rest, (4, 2)", {"solver": Modal(modes=_FOUR)}, has_goal=True),
+    Kind("modal, in motion, (4, 2)", {"solver": Modal(dynamics=True, modes=_FOUR)}, has_goal=True),
 )
 
 
@@ -154,7 +153,7 @@ def _row(run: Run, observers: Sequence[Run], points: int, at_end: State, forces:
         row |= {"ratio": ratios[0], "ratio_default": ratios[1]}
         if run.kind.has_goal:
             row |= {"target": target, "met": " / ".join("yes" if r <= target else "no" for r in ratios)}
-    if "dynamics" not in run.kind.options and run.last is not None:
+    if not run.sims[0].dynamics and run.last is not None:
         error = cases.state_error(run.last, at_end)
         row |= {"error_max_m": error.largest, "error_median_m": error.median}
     return row

@@ -56,11 +56,12 @@ def one_compilation() -> Iterator[None]:
     yield
     if numba.config.DISABLE_JIT:
         return
-    from fastrod.kernels import batch
+    from fastrod.kernels import batch, contact_batch, modal_batch
     from fastrod.kernels.jit import OnThreads
     from fastrod.kernels.rod import cold
 
-    large = {name: loop.one for name, loop in vars(batch).items() if isinstance(loop, OnThreads)}
+    loops = {**vars(batch), **vars(contact_batch)}
+    large = {name: loop.one for name, loop in loops.items() if isinstance(loop, OnThreads)}
     large |= {"move_to_inputs": batch.move_to_inputs, "begin": cold.begin}
-    large |= {"pass_modes": batch.pass_modes, "derive_modes": batch.derive_modes}
+    large |= {"pass_modes": modal_batch.pass_modes, "derive_modes": modal_batch.derive_modes}
     assert {name: len(one.signatures) for name, one in large.items() if len(one.signatures) > 1} == {}

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from fastrod import Robot
+from fastrod import Modes, Robot
 from fastrod.kernels.rod.modal.motion import GENERALIZED_ALPHA
 from fastrod.model.compile import compile_robots
 from fastrod.solver.inputs import Inputs, Reader
-from fastrod.solver.modal import ModalSolver, Modes, Step
+from fastrod.solver.modal import ModalSolver, Step
 from fastrod.types import Floats, RodShape
 
 

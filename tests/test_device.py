@@ -78,10 +78,10 @@ from fastrod.solver.inputs import Inputs
 from fastrod.types import Response
 robot = load_robot("prototype")
 sim = Simulator(robot, outputs="tip")
-passes = sim._passes
+passes = sim._rods.passes
 ports, rows = sim._reader.ports(Inputs(robot.rest_tendon_length)), np.arange(1)
 none = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
-shape = passes.new_shape("tip", False)
+shape = sim._rods.new_shape("tip", False)
 held = passes.layout, passes.memory, shape, none
 arguments = (rows, passes.params, ports, *held, 7, True, False, True, 1.0, 1.0)
 size = batch.room(4, passes.n_x, 7, passes.n_residuals(ports))

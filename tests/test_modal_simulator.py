@@ -16,7 +16,7 @@ from rods import bend, rod
 from test_effects import NAMES, at_neutral, at_typical, having
 from test_simulator_rows import FIELDS, OTHERS, ROWS, N, stiffer
 
-from fastrod import Lump, Modes, Robot, Simulator, State, load_robot
+from fastrod import Lump, Modal, Modes, Robot, Simulator, State, load_robot
 from fastrod.errors import InputError, RobotError
 
 MOVING = {"dynamics": True, "dt": 2e-3}
@@ -249,7 +249,8 @@ def test_effects_of_slow_motion_are_those_of_the_rod_at_rest(name: str) -> None:
 
 @BOTH
 def test_shape_jacobian_and_compliance_are_those_of_the_observer(options: dict[str, Any]) -> None:
-    how = [{**options, "modes": Modes(6, 4)}, {}]
+    fine = Modal(dynamics=options == MOVING, modes=Modes(6, 4))
+    how: list[dict[str, Any]] = [{"solver": fine}, {}]
     modal, observer = (simulator(heavy(), more, points_per_segment=20) for more in how)
     for sim in (modal, observer):
         sim.settle(**inputs(heavy(), 3))
@@ -273,8 +274,8 @@ def test_only_the_tip_is_kept_where_no_more_is_asked_for() -> None:
 
 def test_snapshots_of_another_solver_or_scheme_are_refused() -> None:
     robot = heavy()
-    modes = {"modes": Modes(4, 2)}
-    options: list[dict[str, Any]] = [MOVING, STILL, STILL | modes, MOVING | {"scheme": "bdf2"}, {}]
+    coarse_ones = {"solver": Modal(modes=Modes(4, 2))}
+    options: list[dict[str, Any]] = [MOVING, STILL, coarse_ones, MOVING | {"scheme": "bdf2"}, {}]
     moving, still, coarse, bdf2, observer = sims = [simulator(robot, how) for how in options]
     for sim in sims:
         sim.settle(robot.rest_tendon_length)

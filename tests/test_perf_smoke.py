@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fastrod import Modal
 from fastrod.reference import shoot
 
 
@@ -326,7 +327,7 @@ def test_the_energy_that_the_campaign_counts_is_kept() -> None:
     from fastrod import Simulator
 
     robot = motion_steps.upright(False)
-    sim, rest = Simulator(robot, 1, 2.5e-4, 8, dynamics=True, rho=0.9), robot.rest_tendon_length
+    sim, rest = Simulator(robot, 1, 2.5e-4, 8, solver=Modal(dynamics=True, rho=0.9)), robot.rest_tendon_length
     states = [sim.settle(rest, tip_force=(0.4, 0.0, 0.0)), *(sim.step(rest) for _ in range(400))]
     energy = np.array([motion_steps.energy(robot, state)[0] for state in states])
     kinetic, bend = (

@@ -39,8 +39,8 @@ def jump(k: int) -> dict[str, Any]:
 
 CASES: dict[str, tuple[Robot, dict[str, Any]]] = {
     "plain": (REACHER, {}),
-    "held gain": (REACHER, {"kept_jacobian_tolerance": 1e-4}),
-    "own observer": (REACHER, {"observer": Observer(process_noise=1e4)}),
+    "held gain": (REACHER, {"solver": Observer(kept_jacobian_tolerance=1e-4)}),
+    "own observer": (REACHER, {"solver": Observer(process_noise=1e4)}),
     "tip only": (REACHER, {"outputs": "tip"}),
     "effects with memory": (replace(REACHER, effects=LASH), {}),
     "contact scene": (REACHER, {"contact": FAR}),
@@ -240,12 +240,12 @@ def test_a_press_counts_as_far_as_the_rod_stands_straight() -> None:
         state = sim.step(robot.rest_tendon_length, tip_force=[0.0, 0.0, -2.0 * k / 10])
     ports, shape, rows = sim._ports, state.as_shape(), np.array([0])
     assert ports is not None
-    straight = pressed(sim._passes, ports, shape, rows)[0]
+    straight = pressed(sim._params, ports, shape, rows)[0]
     assert straight == pytest.approx(2.0 * 0.07**2 / 0.0022, rel=1e-9)
     for force in ([2.0, 0.0, 0.0], [0.0, 0.0, 2.0]):
-        assert pressed(sim._passes, ports._replace(tip_force=np.array([force])), shape, rows)[0] < 1e-6
+        assert pressed(sim._params, ports._replace(tip_force=np.array([force])), shape, rows)[0] < 1e-6
     folded = shape._replace(tip_position=np.array([[0.03, 0.0, 0.002]]))
-    assert pressed(sim._passes, ports, folded, rows)[0] < 0.05 * straight
+    assert pressed(sim._params, ports, folded, rows)[0] < 0.05 * straight
 
 
 def test_each_problem_has_a_kind() -> None:

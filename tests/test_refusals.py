@@ -13,7 +13,7 @@ import pytest
 from rods import rod
 
 import fastrod.reference as reference
-from fastrod import Lump, Modes, Observer, Robot, Segment, Simulator, Tendon, load_robot
+from fastrod import Lump, Modal, Modes, Observer, Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.commands.demo import run as demo
 from fastrod.contact import ContactScene, sphere
 from fastrod.control.inverse import plan
@@ -188,17 +188,17 @@ SIMULATORS: Rows = [
     (lambda: Simulator(rod(), threads=1000), "threads is 1000"),
     (lambda: Simulator(rod(), threads=1.5), "threads is 1.5"),
     (lambda: Simulator(rod(), dt="a"), "dt is 'a'"),
-    (lambda: Simulator(rod(), observer=3), "observer is 3"),
+    (lambda: Simulator(rod(), solver=3), "solver is 3"),
     (lambda: Simulator(REACHER, 10**12), r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB"),
     (lambda: Simulator(REACHER, 10**30), "would take"),
     (lambda: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**30), "would take"),
-    (lambda: Simulator(rod(), kept_jacobian_tolerance=-1e-9), "kept_jacobian_tolerance"),
-    (lambda: Simulator(rod(), kept_jacobian_tolerance=np.inf), "kept_jacobian_tolerance"),
-    (lambda: Simulator(rod(), kept_jacobian_tolerance=np.nan), "kept_jacobian_tolerance"),
-    (lambda: Simulator(rod(), kept_jacobian_tolerance="much"), "kept_jacobian_tolerance"),
-    (lambda: Simulator(rod(), kept_jacobian_tolerance=None), "kept_jacobian_tolerance"),
+    (lambda: Observer(kept_jacobian_tolerance=-1e-9), "Observer.kept_jacobian_tolerance"),
+    (lambda: Observer(kept_jacobian_tolerance=np.inf), "Observer.kept_jacobian_tolerance"),
+    (lambda: Observer(kept_jacobian_tolerance=np.nan), "Observer.kept_jacobian_tolerance"),
+    (lambda: Observer(kept_jacobian_tolerance="much"), "Observer.kept_jacobian_tolerance"),
+    (lambda: Observer(kept_jacobian_tolerance=None), "Observer.kept_jacobian_tolerance"),
     (lambda: Simulator(rod()).jacobian(), "call step or settle first"),
     (lambda: Simulator(rod()).compliance(), "call step or settle first"),
     (lambda: Simulator(rod()).shape(0.01), "call step or settle first"),
@@ -273,27 +273,27 @@ MOTION: Rows = [
     (lambda: moving(scheme="bdf3"), "^scheme is 'bdf3'; did you mean 'bdf2'"),
     (lambda: moving(scheme=["bdf1"]), r"^scheme is \['bdf1'\]; did you mean 'bdf1'"),
     *(
-        (lambda rho=rho: moving(rho=rho), f"^rho is {rho!r}; give a number from 0 .* to 0.9")
+        (lambda rho=rho: Modal(dynamics=True, rho=rho), f"^rho is {rho!r}; give a number from 0 .* to 0.9")
         for rho in (1, -0.1, np.nan, "half")
     ),
     (lambda: moving(dt=0.0), "^dt is 0.0 s; it must be a number, positive and finite"),
     (lambda: moving(dynamics=False, scheme="bdf2"), "^scheme is 'bdf2' without dynamics, and nothing moves"),
-    (lambda: moving(dynamics=False, rho=0.8), "^rho is 0.8 without dynamics"),
-    (lambda: moving(modes=(4, 2)), r"^modes is \(4, 2\); give fastrod.Modes\(bending=4, torsion=2\)"),
+    (lambda: Modal(rho=0.8), "^rho is 0.8 without dynamics"),
+    (lambda: Modal(modes=(4, 2)), r"^modes is \(4, 2\); give fastrod.Modes\(bending=4, torsion=2\)"),
     *(
         (
-            lambda name=name, value=value: moving(modes=Modes(**{name: value})),
+            lambda name=name, value=value: Modal(modes=Modes(**{name: value})),
             f"^modes has {name}={value!r}; give a whole number from 1 to {16 if name == 'pieces' else 8}",
         )
         for name, value in (("bending", 0), ("torsion", 9), ("strain", 1.5), ("pieces", "two"))
     ),
-    (lambda: Simulator(rod(), modes=Modes(4, 2)), "^modes was given to the observer, which has none"),
+    (lambda: Simulator(rod(), modes=Modes(4, 2)), "Simulator has no input 'modes'"),
     (
         lambda: moving(contact=scene()),
         "^contact was given with rods of modes, which feel none yet; take solver",
     ),
-    (lambda: moving(observer=Observer()), "^observer was given with rods of modes"),
-    (lambda: moving(kept_jacobian_tolerance=1e-6), "^kept_jacobian_tolerance was given with rods of modes"),
+    (lambda: moving(solver=Observer()), "^dynamics was given beside a solver; give solver=fastrod.Modal"),
+    (lambda: moving(solver=Modal(), dynamics=False, scheme="bdf2"), "^scheme was given beside a solver"),
     *(
         (lambda n=n: moving().step(REST, passes=n), f"^passes is {n!r}; give a whole number from 1 to 100")
         for n in (0, 101, 1.5, "two")

@@ -185,7 +185,7 @@ def test_a_soft_observer_follows_slowly_whatever_the_time_step() -> None:
     robot = load_robot("prototype")
     lengths = bend(robot, 0.5, 0.0)
     for dt in (1e-3, 1e-1, 10.0):
-        sim = Simulator(robot, dt=dt, observer=Observer(process_noise=1.0 / dt, measurement_noise=1e-4 * dt))
+        sim = Simulator(robot, dt=dt, solver=Observer(process_noise=1.0 / dt, measurement_noise=1e-4 * dt))
         residual = [sim.step(robot.rest_tendon_length).residual[0]]
         residual += [sim.step(lengths).residual[0] for _ in range(60)]
         assert np.isfinite(residual).all()
@@ -198,7 +198,7 @@ def test_tip_outputs_keep_little_memory() -> None:
     sim = Simulator(robot, n_robots=64, points_per_segment=4, outputs="tip")
     state = sim.settle(robot.rest_tendon_length)
     names = "residual ok position rotation tension base_wrench tip_position tip_rotation"
-    kept = [*sim._passes.memory, *(getattr(state, name) for name in names.split())]
+    kept = [*sim._rods.passes.memory, *(getattr(state, name) for name in names.split())]
     assert sum(a.nbytes for a in kept) / 64 <= 2000
     with pytest.raises(InputError, match="outputs='full'"):
         sim.shape([0.1])

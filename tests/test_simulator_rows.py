@@ -13,7 +13,7 @@ from contact.robots import bent, prototype
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 
-from fastrod import Robot, Simulator, State, load_robot
+from fastrod import Observer, Robot, Simulator, State, load_robot
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import InputError, RobotError
 from fastrod.model.segment_actions import SegmentActions
@@ -41,7 +41,7 @@ def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
 
 def keeping(robot: Robot, *tolerances: float) -> list[Simulator]:
     options = {"dt": 0.05, "points_per_segment": 2, "threads": 1}
-    return [Simulator(robot, **options, kept_jacobian_tolerance=h) for h in tolerances]
+    return [Simulator(robot, **options, solver=Observer(kept_jacobian_tolerance=h)) for h in tolerances]
 
 
 def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
@@ -126,7 +126,7 @@ def made(case: str) -> tuple[Simulator, Inputs, Step]:
     """A simulator at home, its inputs there, and what it is commanded after."""
     robot, step, contact, hold = CASES[case]
     home = {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim = simulator(robot, contact=contact, kept_jacobian_tolerance=hold)
+    sim = simulator(robot, contact=contact, solver=Observer(kept_jacobian_tolerance=hold))
     sim.settle(**home)
     return sim, home, step
 

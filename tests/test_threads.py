@@ -57,7 +57,7 @@ def test_a_simulator_and_an_environment_hold_it(more: int) -> None:
     """Not a simulator of a few robots: its products are too small for several threads."""
     robot, env, seen = fastrod.load_robot("prototype"), BatchEnv("Reach", FEW + 1), list[list[int]]()
     sim = fastrod.Simulator(robot, FEW + more, points_per_segment=2)
-    for target, name in ((sim._passes, "run"), (env.task, "act")):
+    for target, name in ((sim._rods.passes, "run"), (env.task, "act")):
         inner = getattr(target, name)
         setattr(target, name, lambda *a, inner=inner, **k: (seen.append(counts()), inner(*a, **k))[1])
     sim.step(robot.rest_tendon_length)

@@ -13,11 +13,11 @@ from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
-from fastrod.kernels.batch import arrange, search_gaps, search_worlds
 from fastrod.kernels.contact.iteration import NOTHING
 from fastrod.kernels.contact.problem import MOST_FOUND, contact_problem
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
+from fastrod.kernels.contact_batch import arrange, search_gaps, search_worlds
 from fastrod.types import (
     CANDIDATE,
     CONTACT,

@@ -18,8 +18,8 @@ from fastrod.contact.engine import Engine, starts_of
 from fastrod.contact.frames import blended, longest_move
 from fastrod.contact.progress import Damping, Progress
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT
-from fastrod.kernels.batch import iterate_contact
 from fastrod.kernels.contact.iteration import AT_REST, BACK, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
+from fastrod.kernels.contact_batch import iterate_contact
 from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, PointLoads, Ports, RodShape
 
 COLD_ITERATIONS = 2000

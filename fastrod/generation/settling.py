@@ -14,7 +14,7 @@ import numpy as np
 
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.solver.boundary import BoundarySolver
+from fastrod.solver.boundary import BoundarySolver, new_shape
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.solver.settle import settle
 from fastrod.types import Flags, Floats, Ints, Ports, RodShape
@@ -57,7 +57,7 @@ class ChainSolver:
         Raises `InputError` for inputs that no robot can have; a row that does not converge is not ok.
         """
         ports = self._reader.ports(given)
-        shape = self._passes.new_shape("full", holes=True)
+        shape = new_shape(self.layout, self._passes.n_robots, "full", holes=True)
         left = self._rows if not self._past else self._follow(ports, shape, tolerance)
         ok = np.ones(len(self._rows), bool)
         if len(left):

@@ -22,8 +22,8 @@ from fastrod.rotation import displaced, displacement, quaternion_from_matrix
 from fastrod.simulator import Simulator
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_shape
-from fastrod.solver.modal import Modes
 from fastrod.solver.motion import checked_mobility
+from fastrod.solver.options import Modal, Modes
 from fastrod.solver.rigid import rigid_exchange, rigid_inertia
 from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints
@@ -132,9 +132,7 @@ class Rod:
             points_per_segment,
             threads=threads,
             contact=contact,
-            dynamics=dynamics,
-            rho=rho if dynamics else 0.5,
-            modes=modes,
+            solver=_modal(dynamics, rho, modes),
         )
         """Its `jacobian`, `compliance`, `shape` are those of the last state."""
         self.dt = self.simulator.dt
@@ -559,3 +557,10 @@ def check_robot(robot: object) -> None:
         raise RobotError(
             f"robot is {shown(robot)}; give one Robot, for example fastrod.load_robot('prototype')."
         )
+
+
+def _modal(dynamics: bool, rho: float, modes: Modes | None) -> Modal | None:
+    """Rods of modes where a rod has inertia or modes of its own."""
+    if dynamics:
+        return Modal(dynamics=dynamics, rho=rho, modes=modes)
+    return None if modes is None else Modal(modes=modes)

@@ -38,7 +38,7 @@ from fastrod.loading import robot_of
 from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
-from fastrod.solver.motion import solver_of
+from fastrod.solver.options import Observer, solver_of
 from fastrod.threads import one_blas_thread
 
 MAX_EFFECTS = 4
@@ -140,7 +140,7 @@ def identify(
 
     progressed("base fit", 0, most)
     base = fit_base(some, log.rows, model_of(robot), robot, excluded, threads)
-    if base.left < _FAR * base.noise.floor and solver_of([robot], None, False) == "observer":
+    if base.left < _FAR * base.noise.floor and isinstance(solver_of([robot]), Observer):
         some = log.samples.on(thinned(log.rows, _SEARCH_ROWS))
         base = fit_base(some, log.rows, model_of(robot), robot, excluded, threads, base)
     progressed(base.sentence, 0, most)

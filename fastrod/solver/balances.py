@@ -9,39 +9,22 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.kernels.rod.modal.derivatives import AFTER_JUMP, ModalDerivatives, scheme_table
 from fastrod.kernels.rod.modal.motion import BDF1, GENERALIZED_ALPHA, REST, ModalMotion
-from fastrod.solver.inputs import Inputs
 from fastrod.solver.modal import ModalSolver, Step
 from fastrod.solver.modal_response import full_newton, stiffness
-from fastrod.types import Floats, Ints, Params, Ports
+from fastrod.solver.protocol import Acting
+from fastrod.types import Floats, Ints, Ports
 
 
-class Acting(NamedTuple):
-    """All that acts on the robots in one call, and their numbers."""
-
-    given: Inputs
-    ports: Ports
-    params: Params
-    gravity: Floats
-    """(n_robots, 3)"""
-    points: tuple[Floats, Floats]
-    """Point forces: (n_robots, m) arclength [m] and (n_robots, m, 3) [N]."""
-
-    @classmethod
-    def of(cls, modal: ModalSolver, given: Inputs, ports: Ports, points: tuple[Floats, Floats]) -> Acting:
-        """Return what acts now: copies."""
-        return cls(
-            given,
-            ports._replace(**{k: np.array(a, order="C") for k, a in ports._asdict().items()}),
-            modal.params._replace(**{k: np.array(a, order="C") for k, a in modal.params._asdict().items()}),
-            np.array(modal.pieces.gravity),
-            (np.array(points[0]), np.array(points[1])),
-        )
-
-    def put(self, modal: ModalSolver) -> None:
-        """Let it act on these robots."""
-        modal.params = self.params
-        modal.pieces = modal.pieces._replace(gravity=self.gravity)
-        modal.place_points(*self.points, self.ports.extension)
+def copied_acting(modal: ModalSolver, acting: Acting) -> Acting:
+    """What acts now, in arrays of its own; the gravity that the robots have where none was given."""
+    return acting._replace(
+        ports=acting.ports._replace(**{k: np.array(a, order="C") for k, a in acting.ports._asdict().items()}),
+        params=acting.params._replace(
+            **{k: np.array(a, order="C") for k, a in acting.params._asdict().items()}
+        ),
+        gravity=np.array(modal.pieces.gravity),
+        points=(np.array(acting.points[0]), np.array(acting.points[1])),
+    )
 
 
 class Event(NamedTuple):
@@ -91,7 +74,7 @@ class Balance(NamedTuple):
 def balances_of(modal: ModalSolver, event: Event, first: int) -> list[Balance]:
     """One, or two where inputs jumped. `first` is the scheme by which robots at rest begin to move. `modal`
     is left with what acts in the event. Raises `InputError` where Newton's method does not end."""
-    event.acting.put(modal)
+    modal.take(event.acting)
     if event.step.scheme == REST:
         return [_balance(modal, event, REST, event.before, event.q, first)]
     motion, balances = event.before, []

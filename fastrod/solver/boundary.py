@@ -57,6 +57,32 @@ def _physical_memory() -> int:
         return 2**42
 
 
+def new_shape(layout: Layout, n: int, outputs: Literal["full", "tip"], holes: bool) -> RodShape:
+    """Room for what a pass writes of n robots; `holes`: nan where it will not write."""
+    n_points, n_tendons = len(layout.first_tendon) * layout.n_steps + 1, len(layout.tendon_segment)
+
+    def make(wanted: bool, *axes: int) -> Floats:
+        if not wanted:
+            return np.empty((0, *axes))
+        return np.full((n, *axes), np.nan) if holes else np.empty((n, *axes))
+
+    full = outputs == "full"
+    return RodShape(
+        make(full, n_points, 3),
+        make(full, n_points, 3, 3),
+        make(full, n_points, 3),
+        make(full, n_points),
+        make(full, n_points, 3),
+        make(full, n_points, 3),
+        make(True, 3),
+        make(True, 3, 3),
+        make(full, n_tendons),
+        make(full, n_tendons),
+        make(full, 6),
+        make(True),
+    )
+
+
 class BoundarySolver:
     """Robots of one layout. `params` is replaced where effects change a robot's numbers, and never written
     into.
@@ -141,11 +167,6 @@ class BoundarySolver:
         return np.asarray(np.isfinite(self._memory.x.sum(1)))
 
     @property
-    def n_points(self) -> int:
-        """Nodes along the whole robot."""
-        return len(self.layout.first_tendon) * self.layout.n_steps + 1
-
-    @property
     def n_x(self) -> int:
         """Boundary unknowns of a robot."""
         return int(self._memory.x.shape[1])
@@ -228,33 +249,6 @@ class BoundarySolver:
         if len(memory.force_before):
             memory.force_before[rows] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[rows]
         memory.move[rows], memory.defect[rows] = 0.0, 0.0
-
-    def new_shape(self, outputs: Literal["full", "tip"], holes: bool) -> RodShape:
-        """Room for what a pass writes; `holes`: nan where it will not write."""
-        n, n_points, n_tendons = self.n_robots, self.n_points, len(self.layout.tendon_segment)
-
-        def make(wanted: bool, *axes: int) -> Floats:
-            return (
-                (np.full((n, *axes), np.nan) if holes else np.empty((n, *axes)))
-                if wanted
-                else np.empty((0, *axes))
-            )
-
-        full = outputs == "full"
-        return RodShape(
-            make(full, n_points, 3),
-            make(full, n_points, 3, 3),
-            make(full, n_points, 3),
-            make(full, n_points),
-            make(full, n_points, 3),
-            make(full, n_points, 3),
-            make(True, 3),
-            make(True, 3, 3),
-            make(full, n_tendons),
-            make(full, n_tendons),
-            make(full, 6),
-            make(True),
-        )
 
     def run(
         self,

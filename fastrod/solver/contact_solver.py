@@ -1,15 +1,100 @@
-"""The rods' solver as contact calls it (`fastrod.contact.step.ContactSolver`)."""
+"""Rods of the observer that feel contact: `ContactObserver`, and its passes as contact calls them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from fastrod.contact.engine import Engine
+from fastrod.contact.frames import blended
+from fastrod.contact.step import COLD_ITERATIONS, ContactStep, empty_loads
+from fastrod.errors import Problem
 from fastrod.solver.boundary import BoundarySolver
-from fastrod.solver.recovery import TOLERANCE, Boundary
+from fastrod.solver.guess import unloaded
+from fastrod.solver.observer import DIVERGED, ObserverSolver
+from fastrod.solver.protocol import Acting, How, Last, Response, Solved
+from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, sentence_of
+from fastrod.solver.response import Linear, stretch
 from fastrod.solver.settle import LOST, frozen_noise, frozen_pass, settle
 from fastrod.types import Flags, Floats, Ints, PointLoads, Ports, RodShape
+
+_AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
+
+
+class ContactObserver(ObserverSolver):
+    """The observer's rods, bent by what they touch; they take as many passes a step as bring contact and
+    boundary to rest."""
+
+    def __init__(self, engine: Engine, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.engine = engine
+
+    def step(self, rows: Ints, acting: Acting, last: Last, how: How) -> Solved:
+        """One step of these robots, in passes until contact is at rest."""
+        return self._run(rows, acting, last, None)
+
+    def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
+        """Bring these robots to rest, contact included."""
+        return self._run(rows, acting, last, tolerance)
+
+    def _run(self, rows: Ints, acting: Acting, last: Last, tolerance: float | None) -> Solved:
+        engine, passes, ports, start = self.engine, self.passes, acting.ports, last.ports
+        passes.params = acting.params
+        if start is not None:
+            stretch(passes, rows, ports.extension - start.extension)
+        engine.given_arclength, engine.given_force = acting.points
+        process, noise = self.noise
+        solver = RodSolver(
+            boundary=passes,
+            warm=last.warm,
+            tolerance=tolerance,
+            recovery=Boundary(passes) if self.recover else None,
+            process=process,
+            noise=noise,
+            used=np.zeros(len(self._all), np.int64),
+        )
+        shape = self.new_shape("full", True)
+        ok, done = ContactStep(
+            engine=engine,
+            solver=solver,
+            shape=shape,
+            end=ports,
+            tolerance=tolerance or _AT_REST,
+            most=engine.scene.max_iterations if tolerance is None else COLD_ITERATIONS,
+        ).run(rows, last.warm, start, unloaded(ports, passes.layout, passes.params))
+        problems = {}
+        for i in map(int, rows[~ok[rows]]):
+            problems[i] = (
+                engine.why(i, float(done[i]))
+                if engine.continued[i] and not overloaded(passes.params, ports, i)
+                else sentence_of(DIVERGED, Problem.DIVERGED, passes.params, ports, shape, i)
+            )
+        # a cold robot has no last inputs to go on from: it begins anew
+        gone = np.isin(self._all, rows) & ~ok
+        held = gone & (engine.continued | self.recover) & engine.tracked & ~engine.whole_worlds(~last.warm)
+        if held.any() and start is not None:
+            ports = blended(start, ports, done)
+        passes.arrive_at(np.flatnonzero(held | (ok & engine.continued)), ports)
+        lost = np.flatnonzero(gone & ~(held & engine.continued))
+        used = np.where(ok, solver.used, -1)
+        return Solved(shape, ok, used, ports, "contact", Problem.CONTACT_STUCK, problems, lost, held)
+
+    def response(self, acting: Acting, warm: Flags) -> Response:
+        """Return the linear response of the last shape, contact forces held."""
+        self.passes.params = acting.params
+        rows = np.flatnonzero(warm)
+        most = int(self.engine.contact_set.used[rows].max(initial=0))
+        loads = empty_loads(len(rows), most + 1, self.passes.n_x)
+        return Linear(self.passes, rows, self.engine.held(rows, acting.ports, loads), loads)
+
+    def unstable(self, acting: Acting, shape: RodShape, rows: Ints) -> Ints:
+        """Those of `rows` that touch nothing that would hold them, as without contact."""
+        return super().unstable(acting, shape, rows[~self.engine.continued[rows]])
+
+    def _learn_force(self, rows: Ints, ports: Ports) -> None:
+        """Contact learns anew in every step."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,13 +4,15 @@ by row."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fastrod.contact.engine import ContactSnapshot, Engine
 from fastrod.solver.state import State
 from fastrod.types import Flags, Ints, Ports, RodShape
+
+if TYPE_CHECKING:
+    from fastrod.contact.engine import ContactSnapshot, Engine
 
 Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 

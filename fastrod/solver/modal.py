@@ -7,13 +7,12 @@ import os
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from fastrod.errors import InputError, nearest, shown
-from fastrod.kernels.batch import derive_modes, pass_modes
 from fastrod.kernels.jit import LANES
+from fastrod.kernels.modal_batch import derive_modes, pass_modes
 from fastrod.kernels.rod.modal.chunk import ModalRun
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
 from fastrod.kernels.rod.modal.fields import ModalWork
@@ -34,9 +33,10 @@ from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE
 from fastrod.kernels.rod.modal.output import ModalOutput, ModalSamples, MotionShape
 from fastrod.kernels.rod.modal.workspace import modal_workspace
 from fastrod.model.robot import Robot
+from fastrod.solver.options import Modes, SchemeName
+from fastrod.solver.protocol import Acting
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
-SchemeName: TypeAlias = Literal["bdf1", "bdf2", "generalized_alpha"]
 SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
 _NOTHING = 1e-100
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
@@ -54,17 +54,6 @@ if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's t
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-class Modes(NamedTuple):
-    """Resolution of the rod: modes of a piece, and pieces of a segment."""
-
-    bending: int = 5
-    """Number of modes of the curvature about d1, and about d2."""
-    torsion: int = 3
-    strain: int = 2
-    """Number of modes of the stretch, and of each shear, where a segment has a stiffness for it."""
-    pieces: int = 1
-
-
 class Step(NamedTuple):
     """One step in time."""
 
@@ -74,18 +63,6 @@ class Step(NamedTuple):
     """Spectral radius of generalized-alpha at infinite frequency."""
     passes: int = 1
     """Newton steps at least; more where the last one was large."""
-
-
-def scheme_of(name: str, rho: float) -> int:
-    """The number of a scheme. Raises `InputError` for one that there is not, or a rho that is none."""
-    if not isinstance(name, str) or name not in SCHEMES:
-        raise InputError(f"scheme is {shown(name)}; {nearest(str(name), SCHEMES)}")
-    if not isinstance(rho, (int, float, np.floating, np.integer)) or not 0.0 <= rho <= 0.9:
-        raise InputError(
-            f"rho is {shown(rho)}; give a number from 0 (strongest damping of high frequencies) to 0.9: "
-            "beyond, sudden loads grow."
-        )
-    return SCHEMES[name]
 
 
 def modal_samples(n_segments: int, n_steps: int, per_segment: int, n_degrees: int) -> ModalSamples:
@@ -249,6 +226,13 @@ class ModalSolver:
         """These robots in place of the present ones, of the same layout."""
         self.pieces = cut(robots, self.layout, self.modes.pieces)
         self.gravity = self.pieces.gravity
+
+    def take(self, acting: Acting) -> None:
+        """Let all this act on the robots."""
+        self.params = acting.params
+        gravity = self.gravity if acting.gravity is None else acting.gravity
+        self.pieces = self.pieces._replace(gravity=gravity)
+        self.place_points(*acting.points, acting.ports.extension)
 
     def start_straight(self, rows: Ints) -> None:
         """Let these robots begin from their shape without loads."""

@@ -3,26 +3,110 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from sys import float_info
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numba
 import numpy as np
 
-from fastrod.contact.scene import ContactScene
-from fastrod.errors import InputError, RobotError, shown
-from fastrod.kernels.rod.modal.modes import N_INTERVALS
+from fastrod.errors import InputError, RobotError, nearest, shown
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import check_positive
-from fastrod.solver.modal import Modes, scheme_of
-from fastrod.solver.motion import refuse_with_modes, solver_of
-from fastrod.solver.state import Observer
+
+SchemeName: TypeAlias = Literal["bdf1", "bdf2", "generalized_alpha"]
+SolverName: TypeAlias = Literal["observer", "modal"]
 
 _config: Any = numba.config
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
-_USUAL = "generalized_alpha", 0.5  # scheme and rho of a simulator that is given none
 _MOST_PIECES = 16
+_MOST_MODES = 8  # `kernels.rod.modal.modes.N_INTERVALS`, of which an import takes the kernels along
+
+
+class Modes(NamedTuple):
+    """Resolution of the rod: modes of a piece, and pieces of a segment."""
+
+    bending: int = 5
+    """Number of modes of the curvature about d1, and about d2."""
+    torsion: int = 3
+    strain: int = 2
+    """Number of modes of the stretch, and of each shear, where a segment has a stiffness for it."""
+    pieces: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Solver of rods at rest that takes one forward integration a step: gains of the boundary observer (the
+    paper's Q and V, eqs. 5 and 12), on unknowns scaled to about one. Raises `InputError`.
+
+    Without `process_noise` the gains are so high that a step is a Gauss-Newton step; the variance that is
+    then left over is far below the process noise, and is not carried. More `measurement_noise` smooths the
+    boundary over time.
+    """
+
+    process_noise: float | None = None
+    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
+    measurement_noise: float = 1e-20
+    """V^-1, variance of a boundary residual times time [m^2 s]; with a process noise."""
+    kept_jacobian_tolerance: float = 0.0
+    """Residual [m] below which a step corrects the boundary by the Jacobian that it has (chord Newton),
+    without new sensitivities: a third of the time, and the observer lags by about so much. A robot that feels
+    contact takes new ones."""
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("process_noise", self.process_noise),
+            ("measurement_noise", self.measurement_noise),
+        ):
+            if name == "process_noise" and value is None:
+                continue
+            if not isinstance(value, (int, float, np.floating)) or not 0.0 < value <= float_info.max:
+                raise InputError(f"Observer.{name} is {shown(value)}; it must be positive and finite.")
+        kept = self.kept_jacobian_tolerance
+        if not isinstance(kept, (int, float, np.floating)) or not 0.0 <= kept <= float_info.max:
+            raise InputError(
+                f"Observer.kept_jacobian_tolerance is {shown(kept)} m; it must be a number, zero or positive."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Modal:
+    """Solver of rods of curvature modes: for stretch and shear, and with `dynamics` in motion. Raises
+    `InputError`."""
+
+    dynamics: bool = False
+    """Whether a step moves the rods on by `dt`; else it brings them to rest."""
+    scheme: SchemeName = "generalized_alpha"
+    """Scheme of a step in time: "generalized_alpha" (second order), "bdf2" or "bdf1"."""
+    rho: float = 0.5
+    """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
+    modes: Modes | None = None
+    """Resolution of the rod; None: `Modes(6, 4)` at rest, `Modes(4, 2)` in motion."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dynamics, bool):
+            raise InputError(f"dynamics is {shown(self.dynamics)}; it must be True or False.")
+        names = get_args(SchemeName)
+        if self.scheme not in names:
+            raise InputError(f"scheme is {shown(self.scheme)}; {nearest(str(self.scheme), names)}")
+        if not isinstance(self.rho, (int, float, np.floating, np.integer)) or not 0.0 <= self.rho <= 0.9:
+            raise InputError(
+                f"rho is {shown(self.rho)}; give a number from 0 (strongest damping of high frequencies) to "
+                "0.9: beyond, sudden loads grow."
+            )
+        if not self.dynamics and (self.scheme, self.rho) != (Modal.scheme, Modal.rho):
+            what = f"scheme is {self.scheme!r}" if self.scheme != Modal.scheme else f"rho is {self.rho!r}"
+            raise InputError(f"{what} without dynamics, and nothing moves in time; give dynamics=True.")
+        if self.modes is not None:
+            _check_modes(self.modes)
+
+
+def _check_modes(modes: object) -> None:
+    if not isinstance(modes, Modes):
+        raise InputError(f"modes is {shown(modes)}; give fastrod.Modes(bending=4, torsion=2), or None.")
+    for name, value in modes._asdict().items():
+        most = _MOST_PIECES if name == "pieces" else _MOST_MODES
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
+            raise InputError(f"modes has {name}={shown(value)}; give a whole number from 1 to {most}.")
 
 
 def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:
@@ -43,9 +127,8 @@ def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], 
     return robots, int(n)
 
 
-def check_options(points_per_segment: object, dt: object, outputs: object, kept: object) -> None:
-    """Raise `InputError` for an option of `Simulator` that cannot be; `kept` is its
-    `kept_jacobian_tolerance`."""
+def check_options(points_per_segment: object, dt: object, outputs: object) -> None:
+    """Raise `InputError` for an option of `Simulator` that cannot be."""
     if not isinstance(points_per_segment, (int, np.integer)) or points_per_segment < 2:
         raise InputError(
             f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2."
@@ -53,8 +136,6 @@ def check_options(points_per_segment: object, dt: object, outputs: object, kept:
     check_positive("dt", dt, "s")
     if outputs not in ("full", "tip"):
         raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
-    if not isinstance(kept, (int, float, np.floating)) or not 0.0 <= kept <= float_info.max:
-        raise InputError(f"kept_jacobian_tolerance is {kept!r} m; it must be a number, zero or positive.")
 
 
 def checked_threads(threads: object) -> int:
@@ -67,67 +148,60 @@ def checked_threads(threads: object) -> int:
     return threads
 
 
-def check_solver(
+def solver_of(
     robots: Sequence[Robot],
-    solver: Literal["observer", "modal"] | None,
-    dynamics: bool,
-    scheme: str,
-    rho: float,
-    modes: Modes | None,
-) -> Literal["observer", "modal"]:
-    """The solver of these robots. Raises `InputError` for one that there is not or that cannot do what is
-    asked, and for options that it does not read."""
-    if not isinstance(dynamics, bool):
-        raise InputError(f"dynamics is {dynamics!r}; it must be True or False.")
-    found = solver_of(robots, solver, dynamics)
-    scheme_of(scheme, rho)
-    if modes is not None:
-        _check_modes(modes)
-        if found == "observer":
-            raise InputError("modes was given to the observer, which has none; give solver='modal'.")
-    if not dynamics and (scheme, rho) != _USUAL:
-        what = f"scheme is {scheme!r}" if scheme != _USUAL[0] else f"rho is {rho!r}"
-        raise InputError(f"{what} without dynamics, and nothing moves in time; give dynamics=True.")
-    return found
+    solver: SolverName | Observer | Modal | None = None,
+    dynamics: bool = False,
+    scheme: SchemeName = Modal.scheme,
+) -> Observer | Modal:
+    """The solver of these robots: the observer, the faster one at rest, unless they need modes. Raises
+    `InputError` for one that there is not, or that cannot do what is asked."""
+    if isinstance(solver, (Observer, Modal)):
+        if dynamics or scheme != Modal.scheme:
+            what = "dynamics" if dynamics else "scheme"
+            raise InputError(f"{what} was given beside a solver; give solver=fastrod.Modal({what}=...).")
+    elif solver not in (None, "observer", "modal"):
+        known = nearest(str(solver), ("observer", "modal"))
+        raise InputError(f"solver is {shown(solver)}; {known} Or give a fastrod.Observer or fastrod.Modal.")
+    soft = next(
+        (
+            name
+            for robot in robots
+            for segment in robot.segments
+            for name in ("axial_stiffness", "shear_stiffness", "lumps")
+            if (segment.lumps if name == "lumps" else np.isfinite(getattr(segment, name)))
+        ),
+        None,
+    )
+    if isinstance(solver, Modal):
+        return solver
+    own = solver if isinstance(solver, Observer) else None
+    # a scheme is refused where nothing moves
+    modal = Modal(dynamics=dynamics, scheme=scheme)
+    if (solver == "observer" or own) and (dynamics or soft):
+        what = "dynamics=True" if dynamics else f"a robot with {soft}"
+        raise InputError(f"solver is 'observer' with {what}, which needs solver='modal'.")
+    return modal if dynamics or soft or solver == "modal" else own or Observer()
 
 
-def _check_modes(modes: object) -> None:
-    if not isinstance(modes, Modes):
-        raise InputError(f"modes is {shown(modes)}; give fastrod.Modes(bending=4, torsion=2), or None.")
-    for name, value in modes._asdict().items():
-        most = _MOST_PIECES if name == "pieces" else N_INTERVALS
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
-            raise InputError(f"modes has {name}={shown(value)}; give a whole number from 1 to {most}.")
-
-
-def check_fellows(
-    solver: str,
-    observer: object,
-    contact: object,
-    feel_contact: bool,
-    device: str,
-    kept_jacobian_tolerance: float,
-) -> None:
-    """Raise `InputError` for an observer or a contact scene that is none, and for options that do not go
-    together."""
-    if observer is not None and not isinstance(observer, Observer):
-        raise InputError(f"observer is {observer!r}; give fastrod.Observer(...) or None.")
-    if contact is not None and not isinstance(contact, ContactScene):
-        raise InputError(
-            f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
-        )
+def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool, device: str) -> None:
+    """Raise `InputError` for a contact scene that is none, and for options that do not go together."""
     felt = contact is not None and feel_contact
-    if solver == "modal":
+    if contact is not None:
+        from fastrod.contact.scene import ContactScene
+
+        if not isinstance(contact, ContactScene):
+            raise InputError(
+                f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
+            )
+    if isinstance(solver, Modal):
         if felt:
             raise InputError(
                 "contact was given with rods of modes, which feel none yet; take solver='observer', or "
                 "feel_contact=False."
             )
-        refuse_with_modes(
-            observer=observer is not None,
-            device=device == "cuda",
-            kept_jacobian_tolerance=kept_jacobian_tolerance > 0.0,
-        )
+        if device == "cuda":
+            raise InputError("device was given with rods of modes, which do not take it; leave it out.")
     if device == "cuda" and felt:
         raise InputError(
             "contact was given with device 'cuda', where rods feel none; take "

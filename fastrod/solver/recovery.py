@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from fastrod.errors import Problem, ProblemSentence
 from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.settle import Pass, load_parameter, settle
 from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
@@ -59,13 +60,13 @@ class Boundary:
         return used
 
 
-def overloaded(passes: BoundarySolver, ports: Ports, row: int) -> float:
+def overloaded(params: Params, ports: Ports, row: int) -> float:
     """F l^2/EI of a robot's loads where that is beyond what a rod can hold, else 0."""
-    size = float(load_parameter(np.array([row]), passes.params, ports)[0])
+    size = float(load_parameter(np.array([row]), params, ports)[0])
     return size if size > _HOPELESS else 0.0
 
 
-def pressed(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -> Floats:
+def pressed(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Floats:
     """(n_rows,) compression of each robot's worst segment, P l^2/EI of that segment; zero where the rod is
     pulled.
 
@@ -78,7 +79,6 @@ def pressed(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -
     def of(a: Floats) -> Floats:
         return a if len(a) == 1 else a[rows]
 
-    params = passes.params
     length = of(params.length + ports.extension)
     force = of(ports.tip_force)
     if len(ports.follower_force):
@@ -93,13 +93,13 @@ def pressed(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -
     return np.asarray(np.maximum(along, 0.0) * (length**2 / stiffness).max(1))
 
 
-def unstable(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
+def unstable(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
     """Those of `rows` whose solved shape is an unstable balance, far beyond the load at which a segment
     buckles."""
-    if not len(rows) or _largest_load(passes.params, ports) <= _HOPELESS:
+    if not len(rows) or _largest_load(params, ports) <= _HOPELESS:
         return rows[:0]
-    rows = rows[load_parameter(rows, passes.params, ports) > _HOPELESS]
-    return rows[pressed(passes, ports, shape, rows) > _HOPELESS]
+    rows = rows[load_parameter(rows, params, ports) > _HOPELESS]
+    return rows[pressed(params, ports, shape, rows) > _HOPELESS]
 
 
 def _largest_load(params: Params, ports: Ports) -> float:
@@ -120,12 +120,15 @@ def _largest(a: Floats) -> float:
     return float(np.abs(a).max())
 
 
-def what_to_do(passes: BoundarySolver, ports: Ports, row: int) -> str:
-    """The end of a sentence about a robot without a shape: what to change."""
-    if size := overloaded(passes, ports, row):
-        force = _of(passes.params.moment_scale, row) / _of(passes.params.rod_length, row)
-        return f"its loads are {size:.3g} times what bends it, EI/l^2 = {force:.3g} N: give less load"
-    return "give inputs that a rod of this length can follow, or come there in smaller changes"
+def sentence_of(
+    reason: str, kind: Problem, params: Params, ports: Ports, shape: RodShape, row: int
+) -> ProblemSentence:
+    """Return why a robot has no shape, how far off it is, and what to change."""
+    what = "give inputs that a rod of this length can follow, or come there in smaller changes"
+    if size := overloaded(params, ports, row):
+        kind, force = (Problem.OVERLOADED, _of(params.moment_scale, row) / _of(params.rod_length, row))
+        what = f"its loads are {size:.3g} times what bends it, EI/l^2 = {force:.3g} N: give less load"
+    return ProblemSentence(f"{reason}; residual {shape.residual[row]:.3g} m; {what}.", kind)
 
 
 def _of(a: Floats, row: int) -> float:

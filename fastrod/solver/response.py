@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fastrod.kernels.jit import LANES
-from fastrod.solver.boundary import NO_LOADS, BoundarySolver
+from fastrod.solver.boundary import NO_LOADS, BoundarySolver, new_shape
 from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Response, RodShape
 
 _ROWS = 1024  # of one pass: robots times copies of them
@@ -46,7 +46,7 @@ class Linear:
         if holes:
             for a in response:
                 a.fill(np.nan)
-        shape = passes.new_shape("tip", holes)
+        shape = new_shape(passes.layout, passes.n_robots, "tip", holes)
         passes.run(
             self.rows,
             ports,
@@ -120,7 +120,7 @@ class Linear:
         response = Response(
             np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e))
         )
-        shape = twin.passes.new_shape(outputs, False)
+        shape = new_shape(twin.passes.layout, twin.passes.n_robots, outputs, False)
         twin.passes.run(
             twin.rows,
             twin.ports,

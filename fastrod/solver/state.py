@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fastrod.contact.contacts import Contacts
-from fastrod.contact.engine import ContactSnapshot
-from fastrod.errors import InputError, Problem, ProblemSentence, shown
+from fastrod.errors import InputError, Problem, ProblemSentence
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
-from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, RodShape
+from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from fastrod.contact.contacts import Contacts
+    from fastrod.contact.engine import ContactSnapshot
 
-@dataclass(frozen=True, kw_only=True)
-class Observer:
-    """Gains of the boundary observer (the paper's Q and V, eqs. 5 and 12), on unknowns scaled to about one.
-
-    A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the
-    variance that is then left over is far below the process noise, and is not carried. More
-    `measurement_noise` smooths the boundary over time.
-    """
-
-    process_noise: float = 100.0
-    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
-    measurement_noise: float = 1e-20
-    """V^-1, variance of a boundary residual times time [m^2 s]."""
-
-    def __post_init__(self) -> None:
-        for name in ("process_noise", "measurement_noise"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
+MOVING = ("velocity", "strain", "kinetic_energy", "strain_energy")
+"""Fields of a `State` that rods of modes have."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -161,9 +143,10 @@ class Snapshot(NamedTuple):
     """Everything that a later step depends on."""
 
     robots: tuple[Robot, ...]
-    memory: Memory
+    memory: Any
+    """Memory of the solver."""
     warm: Flags
-    """(n_robots,) the boundary is that of an earlier step."""
+    """(n_robots,) there is a shape to go on from."""
     given: Inputs
     ports: Ports | None
     state: State | None
@@ -174,26 +157,12 @@ class Snapshot(NamedTuple):
     time: Floats
     """(n_robots,) as effects count it [s]; nan before the first step."""
     contact: ContactSnapshot | None
-    moving: Any = None
-    """Memory of rods of modes."""
 
 
-def check_snapshot(
-    snapshot: Snapshot, n_robots: int, n_rows: int, effects: list[Floats], has_contact: bool
-) -> None:
-    """Raise `InputError` where a snapshot is none of the simulator with so many robots and commanded tendons,
-    these memories of effects, and perhaps a contact scene."""
-    if not isinstance(snapshot, Snapshot):
-        raise InputError(f"the snapshot is {shown(snapshot)}; give what Simulator.snapshot() returned.")
-    then = snapshot.memory
-    if (len(then.x), then.length_before.shape[1]) != (n_robots, n_rows):
-        raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
+def check_snapshot(snapshot: Snapshot, effects: list[Floats], has_contact: bool) -> None:
+    """Raise `InputError` where a snapshot is none of a simulator with these memories of effects, and perhaps
+    a contact scene."""
     if [a.shape for a in snapshot.effects] != [a.shape for a in effects]:
         raise InputError("the snapshot is of another simulator; its effects differ.")
     if (snapshot.contact is None) == has_contact:
         raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
-
-
-def copied(memory: Memory) -> Memory:
-    """A memory with arrays of its own."""
-    return Memory._make(a.copy() for a in memory)

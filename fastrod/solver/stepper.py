@@ -4,7 +4,7 @@ end."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from fastrod.contact.frames import blended
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import MotionShape
 from fastrod.rotation import displaced
+from fastrod.solver.guess import unloaded
 from fastrod.solver.modal import ModalSolver, Step
 from fastrod.solver.modal_response import full_newton
-from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
+from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 
 _JUMP = 2.0
 """A change of an input of more than so many times the one before is a jump: the acceleration after it is then
@@ -31,7 +32,6 @@ _MOVING = (
     "node_force",
     "base_pose",
 )
-_LOADS = ("tension", "tip_force", "tip_moment", "follower_force", "follower_line", "line_force", "node_force")
 _RECORDED = 6  # Newton steps at least, of a step that is recorded
 _HALVINGS = 5  # of a step whose Newton's method does not end
 _FRACTIONS = np.linspace(0.125, 1.0, 8)  # of the load, where a robot does not come to rest at once
@@ -189,13 +189,6 @@ class TimeStepper:
             jump[(change[name] > _JUMP * last) & (change[name] > 0.0)] = 1.0
         self.change = change
         return jump
-
-
-def unloaded(ports: Ports, layout: Layout, params: Params) -> Ports:
-    """The straight robot on the same base, without loads."""
-    ends = np.cumsum(params.length + ports.extension, axis=1)[:, layout.tendon_segment]
-    zeros: dict[str, Any] = {name: 0.0 * getattr(ports, name) for name in _LOADS}
-    return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
 
 
 def copied(motion: ModalMotion) -> ModalMotion:

@@ -14,6 +14,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
+from fastrod.solver.options import Observer
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.randomisation import Randomisation
@@ -33,7 +34,7 @@ class RodTask(Task):
     points_per_segment: int
     outputs: ClassVar[Any] = "tip"
     kept_jacobian_tolerance: float = 5e-5
-    """`Simulator(kept_jacobian_tolerance=...)` [m]."""
+    """`Observer(kept_jacobian_tolerance=...)` [m]."""
     loaded: ClassVar[bool] = False
     """An episode brings loads of its own: robots settle under them when it begins."""
     on_gpu: ClassVar[bool] = True
@@ -88,7 +89,7 @@ class RodTask(Task):
             outputs=self.outputs,
             threads=options.threads,
             contact=contact,
-            kept_jacobian_tolerance=self.kept_jacobian_tolerance,
+            solver=Observer(kept_jacobian_tolerance=self.kept_jacobian_tolerance),
             feel_contact=feel_contact,
             device=options.device,
         )

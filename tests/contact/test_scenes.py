@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from fastrod.kernels.batch import iterate_some
+from fastrod.kernels.contact_batch import iterate_some
 
 
 @pytest.mark.study

@@ -233,10 +233,11 @@ def test_odd_rows_and_arclengths_are_refused_and_change_nothing(rows: Any, what:
             "dt",
             "points_per_segment",
             "outputs",
-            "observer",
+            "solver",
+            "dynamics",
+            "scheme",
             "threads",
             "contact",
-            "kept_jacobian_tolerance",
         ]
     ),
     value=odd_values,

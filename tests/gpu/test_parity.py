@@ -127,7 +127,7 @@ def test_steep_loads_take_the_same_way() -> None:
 
 
 def test_an_observer_that_carries_its_covariance() -> None:
-    here, there = pair(rod(), observer=Observer(process_noise=1.0, measurement_noise=1e-10))
+    here, there = pair(rod(), solver=Observer(process_noise=1.0, measurement_noise=1e-10))
     for k in range(4):
         a, b = (sim.step(**inputs(rod(), k)) for sim in (here, there))
     assert_allclose(b.tip_position, a.tip_position, atol=1e-9)
@@ -136,7 +136,7 @@ def test_an_observer_that_carries_its_covariance() -> None:
 
 
 def test_a_held_gain() -> None:
-    here, there = pair(rod(), kept_jacobian_tolerance=1e-3, outputs="tip")
+    here, there = pair(rod(), solver=Observer(kept_jacobian_tolerance=1e-3), outputs="tip")
     for k in range(4):
         a, b = (sim.step(inputs(rod(), k)["tendon_length"]) for sim in (here, there))
     assert_allclose(b.tip_position, a.tip_position, atol=1e-11)

@@ -28,7 +28,7 @@ def test_a_steady_step_fetches_no_memory_and_sends_what_changed(monkeypatch: pyt
     monkeypatch.setattr(
         Resident, "read", lambda self, fields=FIELDS: fetched.append(set(fields)) or read(self, fields)
     )
-    runner = sim._passes._runner
+    runner = sim._rods.passes._runner
     assert runner is not None
     sent, brought = runner.sent_bytes, runner.fetched_bytes
     sim.step(1.0002 * lengths)
@@ -82,7 +82,7 @@ def test_a_memory_that_the_host_wrote_into_is_the_newer_one() -> None:
     here, there = pair(rod())
     for sim in (here, there):
         sim.settle(**inputs(rod(), 0))
-        sim._passes.memory.x[1] *= 1.001
+        sim._rods.passes.memory.x[1] *= 1.001
     assert_same(*(sim.step(**inputs(rod(), 0)) for sim in (here, there)))
     assert np.abs(there.state.residual[1]) > 1e-9
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from modal_rods import Rods
 
-from fastrod import Robot, Segment, Tendon
+from fastrod import Modes, Robot, Segment, Tendon
 from fastrod.kernels.rod.modal.motion import GENERALIZED_ALPHA
 from fastrod.model.robot import Lump
-from fastrod.solver.modal import Modes, Step
+from fastrod.solver.modal import Step
 
 TRUTH = Path(__file__).parents[3] / "shared" / "truth" / "dynamics_truth.json"
 CASES = json.loads(TRUTH.read_text()) if TRUTH.exists() else []

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from fastrod import Modes, Robot, Segment, Simulator, Tendon, Tips
+from fastrod import Modal, Modes, Robot, Segment, Simulator, Tendon, Tips
 from fastrod.errors import InputError
 
 LENGTH, STIFFNESS = 0.2, np.array([0.02, 0.03, 0.015])
@@ -76,7 +76,7 @@ def tip_of(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_a_cantilever_beside_an_integration_from_its_tip(force: list[tuple[float, float, float]]) -> None:
     """Bends of 0.1 to 0.3 of the length."""
     given = np.array(force)
-    state = Simulator(rod(), solver="modal", modes=FINE).settle(LOOSE, follower_line_force=given[None])
+    state = Simulator(rod(), solver=Modal(modes=FINE)).settle(LOOSE, follower_line_force=given[None])
     position, rotation = tip_of(given)
     assert state.ok.all()
     assert np.linalg.norm(position - (0.0, 0.0, LENGTH)) > 0.01
@@ -85,7 +85,7 @@ def test_a_cantilever_beside_an_integration_from_its_tip(force: list[tuple[float
 
 
 def test_one_force_is_that_at_every_point() -> None:
-    sim = Simulator(rod(), n_robots=2, solver="modal", modes=FINE)
+    sim = Simulator(rod(), n_robots=2, solver=Modal(modes=FINE))
     force = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, -1.0]])
     one = sim.settle(LOOSE, follower_line_force=force)
     each = sim.settle(LOOSE, follower_line_force=np.repeat(force[:, None, None], 5, axis=2))
@@ -96,7 +96,7 @@ def test_one_force_is_that_at_every_point() -> None:
 def test_forces_and_moments_on_the_base_are_those_of_the_load() -> None:
     """Uniform f: the base carries the integral of R f, and of r x R f."""
     f = np.array([2.0, 1.0, -0.5])
-    state = Simulator(rod(), solver="modal", modes=FINE, points_per_segment=80).settle(
+    state = Simulator(rod(), solver=Modal(modes=FINE), points_per_segment=80).settle(
         LOOSE, follower_line_force=f
     )
     world = state.rotation[0] @ f
@@ -108,7 +108,7 @@ def test_forces_and_moments_on_the_base_are_those_of_the_load() -> None:
 def test_the_jacobian_has_the_rotation_of_the_load() -> None:
     """Taut tendons and a load that bends by 0.3 rad, against differences."""
     base, step = rod().rest_tendon_length - np.array([2e-3, 1e-3, 0.0]), 1e-6
-    sim = Simulator(rod(), solver="modal", modes=FINE)
+    sim = Simulator(rod(), solver=Modal(modes=FINE))
     load = {"follower_line_force": (6.0, 2.0, -4.0)}
     sim.settle(base, **load)
     found = sim.jacobian()[0, :3, :3]
@@ -122,12 +122,12 @@ def test_the_jacobian_has_the_rotation_of_the_load() -> None:
 def test_in_motion_it_comes_to_rest_where_it_rests() -> None:
     """A load that begins suddenly, much damping."""
     robot = rod(density=0.3, damping_time=0.05)
-    sim = Simulator(robot, dynamics=True, dt=2e-3, scheme="generalized_alpha", modes=FINE)
+    sim = Simulator(robot, dt=2e-3, solver=Modal(dynamics=True, modes=FINE))
     sim.settle(LOOSE)
     load = {"follower_line_force": (2.0, 1.0, -1.0)}
     for _ in range(1500):
         state = sim.step(LOOSE, **load)
-    still = Simulator(robot, solver="modal", modes=FINE).settle(LOOSE, **load)
+    still = Simulator(robot, solver=Modal(modes=FINE)).settle(LOOSE, **load)
     assert state.kinetic_energy[0] < 1e-12
     assert_allclose(state.tip_position, still.tip_position, atol=1e-7)
 
@@ -138,7 +138,7 @@ def test_a_step_has_second_order() -> None:
     robot = rod(density=0.3, damping_time=0.01)
     tips = {}
     for n in (160, 320, 640, 1280):
-        sim = Simulator(robot, dynamics=True, dt=0.04 / n, modes=FINE)
+        sim = Simulator(robot, dt=0.04 / n, solver=Modal(dynamics=True, modes=FINE))
         sim.settle(LOOSE, follower_line_force=(0.0, 0.0, 0.0))
         for k in range(n):
             force = np.array([3.0, 1.0, 0.0]) * ((k + 1) / n) ** 2

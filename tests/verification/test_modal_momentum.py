@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from rods import rod
 from scipy.integrate import simpson
 
-from fastrod import Lump, Modes, Robot, Simulator, State
+from fastrod import Lump, Modal, Modes, Robot, Simulator, State
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 
 DENSITY, LUMP, LENGTH = 0.1, Lump(at=0.035, mass=0.004), 0.07
@@ -66,8 +66,8 @@ def given(state: State, base: np.ndarray) -> np.ndarray:
 
 def imbalance(base: Base, dt: float, scheme: str) -> np.ndarray:
     """(6,) root mean square of d/dt momentum less what is given, over the largest given, from 10 ms on."""
-    how: dict[str, Any] = {"scheme": scheme, "modes": Modes(6, 4, pieces=2), "points_per_segment": 28}
-    sim = Simulator(robot(), dt=dt, dynamics=True, **how)
+    how: dict[str, Any] = {"scheme": scheme, "modes": Modes(6, 4, pieces=2)}
+    sim = Simulator(robot(), dt=dt, solver=Modal(dynamics=True, **how), points_per_segment=28)
     home = robot().rest_tendon_length
     pull = np.array([-2e-3, 1e-3, 2e-3, -1e-3])
     states = [sim.settle(home, tip_force=FORCE, base_pose=base(0.0))]

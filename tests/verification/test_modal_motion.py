@@ -13,10 +13,9 @@ from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from fastrod import Robot, Segment, Simulator, load_robot
+from fastrod import Modal, Modes, Robot, Segment, Simulator, load_robot
 from fastrod.kernels.jit import LANES
 from fastrod.model.robot import Lump
-from fastrod.solver.modal import Modes
 
 LENGTH, EI, GJ, DENSITY = 0.4, 0.02, 0.015, 0.05
 BENDING = (1.8751040687, 4.6940911330, 7.8547574382)
@@ -37,7 +36,8 @@ def beam(*lumps: Lump, **more: Any) -> Robot:
 
 
 def moving(robot: Robot, dt: float = 1e-3, **options: Any) -> Simulator:
-    return Simulator(robot, dt=dt, dynamics=True, points_per_segment=4, **options)
+    """With these options of `Modal`."""
+    return Simulator(robot, dt=dt, solver=Modal(dynamics=True, **options), points_per_segment=4)
 
 
 def exact_frequencies(mass: float) -> np.ndarray:

@@ -10,8 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_bvp
 
-from fastrod import Robot, Segment, Simulator, load_robot
-from fastrod.solver.modal import Modes
+from fastrod import Modal, Modes, Observer, Robot, Segment, Simulator, load_robot
 
 FINE = Modes(6, 4, strain=3)
 PULLED = np.array([[-0.002, 0.0, 0.002, 0.0], [-0.001, 0.001, 0.001, -0.001], [0.0, 0.0, 0.0, 0.0]])
@@ -80,8 +79,8 @@ def inputs_of(robot: Robot, given: dict[str, Any]) -> dict[str, Any]:
 def test_modes_and_observer_come_to_the_same_rest(name: str) -> None:
     robot, modes, given, tolerance = CASES[name]
     states, tips = [], []
-    for kind, options in (("observer", {}), ("modal", {"modes": modes})):
-        sim = Simulator(robot, 3, points_per_segment=40, solver=kind, **options)  # type: ignore[arg-type]
+    for kind in (Observer(), Modal(modes=modes)):
+        sim = Simulator(robot, 3, points_per_segment=40, solver=kind)
         states.append(sim.settle(**inputs_of(robot, given)))
         assert states[-1].ok.all(), states[-1].problems
         tips.append(sim.shape(np.array([0.02, 0.035, 0.061])))
@@ -105,8 +104,8 @@ ANSWERS = ["tip force", "follower", "two segments", "point forces", "longer", "t
 def test_modes_and_observer_answer_alike(name: str) -> None:
     robot, _, given, _ = CASES[name]
     found = []
-    for kind, options in (("observer", {}), ("modal", {"modes": Modes(6, 4, pieces=3)})):
-        sim = Simulator(robot, 3, points_per_segment=40, solver=kind, **options)  # type: ignore[arg-type]
+    for kind in (Observer(), Modal(modes=Modes(6, 4, pieces=3))):
+        sim = Simulator(robot, 3, points_per_segment=40, solver=kind)
         sim.settle(**inputs_of(robot, given))
         found.append((sim.jacobian(turning=True), sim.compliance()))
     for modal, observer in zip(found[1], found[0], strict=True):
@@ -125,7 +124,7 @@ def beam(**stiffness: float) -> Robot:
 
 def test_a_rod_stretches_by_force_over_stiffness() -> None:
     force = 3.0
-    sim = Simulator(beam(axial_stiffness=EA), modes=Modes(4, 2, strain=1))
+    sim = Simulator(beam(axial_stiffness=EA), solver=Modal(modes=Modes(4, 2, strain=1)))
     state = sim.settle(tip_force=(0.0, 0.0, force))
     assert_allclose(state.tip_position[0], [0.0, 0.0, LENGTH * (1.0 + force / EA)], atol=1e-12)
     assert state.strain is not None
@@ -136,7 +135,7 @@ def test_a_rod_deflects_as_timoshenko_says() -> None:
     """A small force: F l^3 / 3 EI by bend, F l / GA by shear."""
     force = 1e-4
     tips = [
-        Simulator(beam(**more), solver="modal", modes=Modes(4, 2))
+        Simulator(beam(**more), solver=Modal(modes=Modes(4, 2)))
         .settle(tip_force=(force, 0.0, 0.0))
         .tip_position[0, 0]
         for more in ({}, {"shear_stiffness": GA})
@@ -168,7 +167,8 @@ def test_a_rod_that_shears_and_stretches_bends_as_reissners() -> None:
     )
     assert exact.success
     assert exact.y[2, -1] > 1.4  # rad: a large bend
-    sim = Simulator(beam(axial_stiffness=EA, shear_stiffness=GA), modes=Modes(4, 2, strain=3, pieces=4))
+    fine = Modal(modes=Modes(4, 2, strain=3, pieces=4))
+    sim = Simulator(beam(axial_stiffness=EA, shear_stiffness=GA), solver=fine)
     state = sim.settle(tip_force=(fx, 0.0, fz))
     assert_allclose(state.tip_position[0, [0, 2]], exact.y[:2, -1], rtol=0, atol=2e-8)
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import rod as small
 
-from fastrod import Robot, Rod, Simulator
+from fastrod import Modal, Robot, Rod, Simulator
 from fastrod.errors import InputError
 from fastrod.hosts.host import Motion
 
@@ -25,7 +25,7 @@ def beam() -> Robot:
 def test_a_shaken_rod_gives_the_simulators_wrench() -> None:
     """In substeps, along a twist that changes from one of the host's steps to the next."""
     rod = Rod(beam(), dt=1e-3, dynamics=True)
-    sim = Simulator(beam(), dt=1e-3, dynamics=True, rho=0.0, points_per_segment=10, threads=1)
+    sim = Simulator(beam(), dt=1e-3, solver=Modal(dynamics=True, rho=0.0), points_per_segment=10, threads=1)
     base = np.array(HOME)
     rod.settle(base)
     sim.settle(base_pose=base)

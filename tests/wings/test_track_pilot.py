@@ -19,6 +19,7 @@ from fastrod.errors import InputError, UnknownNameError
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
+from fastrod.solver.options import Observer
 from fastrod.types import Floats
 from fastrod_envs.policies import Policy, find
 from fastrod_envs.policy_driver import PolicyDriver
@@ -67,7 +68,7 @@ def follow(pilot: PolicyDriver, robot: Robot, n_steps: int = 120) -> dict[str, A
         dt=DT,
         points_per_segment=Track.points_per_segment,
         outputs="tip",
-        kept_jacobian_tolerance=Track.kept_jacobian_tolerance,
+        solver=Observer(kept_jacobian_tolerance=Track.kept_jacobian_tolerance),
     )
     simulator.settle(robot.rest_tendon_length)
     found: dict[str, Any] = {"dl": [], "tip": []}

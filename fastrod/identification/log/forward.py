@@ -43,8 +43,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion, segment_bends
 from fastrod.solver.inputs import Inputs, Reader
-from fastrod.solver.modal import Modes
-from fastrod.solver.motion import solver_of
+from fastrod.solver.options import Modal, Modes, solver_of
 from fastrod.types import Flags, Floats, Ints, Params, Ports
 
 TOLERANCE = 1e-8  # of the robot's length: far below any camera
@@ -199,7 +198,7 @@ class PredictedRod:
             n_robots=n,
             points_per_segment=N_STEPS,
             outputs="full",
-            modes=MODES if solver_of([bare], None, False) == "modal" else None,
+            solver=Modal(modes=MODES) if isinstance(solver_of([bare]), Modal) else None,
             threads=threads,
         )
         # a step of first order goes by the tendons that are slack before it, and is wrong where others are

@@ -1,42 +1,40 @@
-"""`Statics`: a batch of robots with its boundary, inputs, effects and last state, and one step or `settle`
-of it.
+"""`RobotBatch`: a batch of robots with its inputs, effects and last state, whichever way the rods are solved.
 
 `Simulator` is this with options that are checked, the inputs' names, contact and queries.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.contact.engine import Engine
-from fastrod.contact.step import empty_loads
 from fastrod.effects.pipeline import EffectPipeline
 from fastrod.errors import InputError, Problem, ProblemSentence, RobotError, shown
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.solver.boundary import BoundarySolver, check_size
-from fastrod.solver.gpu.device import Device
-from fastrod.solver.guess import cold_start
+from fastrod.solver.boundary import check_size
 from fastrod.solver.inputs import Inputs, Reader, robot_mask
 from fastrod.solver.merge import (
     keep_lost,
     merge_arrays,
     merge_problems,
+    merge_rows,
     merge_shape,
     replace_arrays,
     replace_rows,
     restore_contact,
 )
-from fastrod.solver.recovery import Boundary, overloaded, unstable, what_to_do
-from fastrod.solver.response import Linear, stretch
-from fastrod.solver.settle import LOST, Pass, frozen_pass, settle
-from fastrod.solver.state import Observer, Snapshot, State, check_snapshot, copied
+from fastrod.solver.protocol import Acting, How, Last, Solved, Solver
+from fastrod.solver.recovery import sentence_of
+from fastrod.solver.state import MOVING, Snapshot, State, check_snapshot
 from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
+
+if TYPE_CHECKING:
+    from fastrod.contact.engine import Engine
 
 _ALONG = (
     "position",
@@ -49,13 +47,15 @@ _ALONG = (
     "path_length",
     "base_wrench",
 )
-DIVERGED = "the observer diverged, and no shape was found on these inputs"
 _BALANCE = 40  # rounds of `settle` in which a rod and a force that goes by its tip come to rest
 _UNSTABLE = "the shape that balances its loads is an unstable one"
 
 
-class Statics:
-    """Robots of one layout, from one step to the next."""
+class RobotBatch:
+    """Robots of one layout, from one call to the next."""
+
+    _rods: Solver
+    """How they are solved; set by `Simulator`."""
 
     def __init__(
         self,
@@ -63,26 +63,15 @@ class Statics:
         n_robots: int,
         dt: float,
         n_steps: int,
-        *,
         outputs: Literal["full", "tip"],
-        observer: Observer | None,
-        threads: int,
-        device: Device,
-        kept_jacobian_tolerance: float,
-        recover: bool,
     ) -> None:
         self.robots, self.n_robots, self.dt, self.outputs = robots, n_robots, dt, outputs
-        self.observer = observer or Observer()
-        self.kept_jacobian_tolerance, self.recover = kept_jacobian_tolerance, recover
         self._layout, self._plain, rest = compile_robots(robots, n_steps)
         check_size(self._layout, n_robots, outputs)
-        self._passes = BoundarySolver(
-            self._layout, self._plain, n_robots, threads, propagate=observer is not None, device=device
-        )
+        self._params = self._plain  # what the kernel reads; _plain is the robot before effects
         self._reader = Reader(self._layout, self._plain, rest, n_robots)
         self._chain = EffectPipeline(robots, n_robots)
-        # the last ports before effects; _plain is the robot before them
-        self._bare: Ports | None = None
+        self._bare: Ports | None = None  # the last ports before effects
         self._all = np.arange(n_robots)
         self._warm = np.zeros(n_robots, bool)
         self._shaped = np.zeros(n_robots, bool)  # whose state holds a solved shape, of this very robot
@@ -96,69 +85,32 @@ class Statics:
     @property
     def n_points(self) -> int:
         """Nodes along the whole robot."""
-        return self._passes.n_points
+        return len(self._layout.first_tendon) * self._layout.n_steps + 1
 
     @property
     def state(self) -> State:
         """The last state. Raises `InputError` before the first step."""
         return self._last("state")[0]
 
-    def _step(self, given: Inputs, moved: tuple[Any, Any] | None, derive: bool) -> State:
-        """One observer pass on these inputs; `moved` are the obstacles that no rod feels."""
-        tracked = self._passes.tracks_force
+    @property
+    def _before(self) -> Last:
+        return Last(self._warm, self._ports, self._state)
+
+    def _acting(self, ports: Ports) -> Acting:
+        return Acting(self._given, ports, self._params, self._reader.gravity, self._reader.loads)
+
+    def _step(self, given: Inputs, how: How, moved: tuple[Any, Any] | None) -> State:
+        """One step on these inputs, `moved` obstacles included."""
+        before = self._before
         ports, rows = self._read(given)
         self._move_obstacles(moved)
-        boundary = Boundary(self._passes) if self.recover else None
-        before = self._ports
-        learns = before is not None and not tracked and self._passes.tracks_force
-        if before is not None and learns and _alike(before, ports):
-            self._learn_force(rows[self._warm[rows]], before)
-        if before is not None:
-            stretch(self._passes, rows, ports.extension - before.extension)
-        if len(cold := rows[~self._warm[rows]]):
-            cold_start(cold, self._layout, self._passes.params, ports, self._passes.memory)
-        linear = Linear(self._passes, rows, ports)
-        if derive and self._bare is None and len(rows) == self.n_robots and linear.fits(turning=True):
-            relocate = self._relocated if given.point_force else None
-            process, noise = self._noise
-            shape, self._derived = linear.step(relocate, True, self.outputs, process=process, noise=noise)
-        else:
-            shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
-            kept = self._keeps_jacobian(learns)[rows]
-            if kept.any():
-                self._passes.run(rows[kept], ports, shape, predict=True, n_col=0)
-            if not kept.all():
-                self._observe(rows[~kept], ports, shape, predict=True)
-            self._passes.collect(shape)
-        ok = self._passes.finite & (shape.residual < LOST * self._passes.params.rod_length)
-        passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
-        if len(rows) < self.n_robots:
-            read = np.isin(self._all, rows)
-            ok, passes = ok & read, np.where(read, passes, 0)
-        if boundary is not None and not ok[rows].all():
-            lost, self._derived = rows[~ok[rows]], None
-            used = boundary.recover(lost, self._warm, ports, self._into(shape))
-            self._passes.collect(shape)
-            ok |= (used > 0) & (shape.residual < LOST * self._passes.params.rod_length)
-            passes = np.where(used < 0, -1, passes + used)
-        return self._finish(ports, shape, ok, passes, DIVERGED, Problem.DIVERGED, rows[~ok[rows]])
-
-    @property
-    def _noise(self) -> tuple[float, float]:
-        """Process and measurement noise of one step."""
-        return self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
-
-    def _observe(self, rows: Ints, ports: Ports, shape: RodShape, *, predict: bool) -> None:
-        """A pass of the observer, with its own gains."""
-        process, noise = self._noise
-        propagate = self._passes.propagate
-        self._passes.run(
-            rows, ports, shape, predict=predict, propagate=propagate, process=process, noise=noise
+        how = how._replace(
+            derive=how.derive and self._bare is None, relocate=self._relocated if given.point_force else None
         )
+        return self._note(self._rods.step(rows, self._acting(ports), before, how), rows)
 
-    def _learn_force(self, rows: Ints, ports: Ports) -> None:
-        """A pass that changes nothing but the gain, which now knows a tip force."""
-        self._observe(rows, ports, self._passes.new_shape("tip", True), predict=False)
+    def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
+        return self._note(self._rods.settle(rows, self._acting(ports), self._before, tolerance), rows, only)
 
     def settle_ports(
         self,
@@ -172,32 +124,12 @@ class Statics:
         whole log themselves. `params` may have a row for each robot; `robot` has the numbers of rods of modes
         that are not among them: mass, lumps, stretch and shear. With `tolerance` inf those take one Newton
         step, exact to first order. Robots that are not in `rows` are not solved, and not `ok`."""
-        self._use_numbers(robot)
+        if robot is not None:
+            self._rods.replace((robot,))
         self._reader.problems, self._derived = {}, None
-        self._passes.params, self._bare = params, None
-        self._passes.remember(False, False, None)
+        self._params, self._bare = params, None
+        self._rods.remember(ports, False, Last(self._warm, None, None))
         return self._settle(ports, self._all if rows is None else rows, tolerance)
-
-    def _use_numbers(self, robot: Robot | None) -> None:
-        """Take what only rods of modes read."""
-
-    def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
-        shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
-
-        passes = settle(rows, self._warm, self._passes, ports, tolerance, self._into(shape))
-        self._passes.collect(shape)
-        if self._passes.propagate:
-            self._passes.memory.covariance[rows] = 0.0
-        ok = np.zeros(self.n_robots, bool)
-        ok[rows] = passes[rows] > 0
-        reason = f"settle did not bring the boundary residual below {tolerance:g} m"
-        if not ok[rows].all() and (shape.residual[rows[~ok[rows]]] <= tolerance).any():
-            reason = f"settle found no boundary that rests with a residual below {tolerance:g} m"
-        return self._finish(ports, shape, ok, passes, reason, Problem.NOT_CONVERGED, rows[~ok[rows]], only)
-
-    def _into(self, shape: RodShape) -> Pass:
-        """Passes on frozen inputs that write into `shape`."""
-        return frozen_pass(self._passes, shape)
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the boundary of these robots (all by default): their next step begins from the cold guess,
@@ -208,28 +140,29 @@ class Statics:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on."""
-        effects = [link.memory.copy() for link in self._chain.links]
         return Snapshot(
             self.robots,
-            copied(self._passes.peek()),
+            self._rods.snapshot(),
             self._warm.copy(),
             self._given,
             self._ports,
             self._state,
-            self._passes.params,
+            self._params,
             self._bare,
-            effects,
+            [link.memory.copy() for link in self._chain.links],
             self._chain.time.copy(),
             None if self._engine is None else self._engine.snapshot(),
         )
 
     def restore(self, snapshot: Snapshot, rows: ArrayLike | None = None) -> None:
         """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Robots that
-        were replaced since keep their numbers, and take over the boundary alone; a whole simulator of which
-        some were replaced is refused. Raises `InputError` then, and for a snapshot of another simulator."""
+        were replaced since keep their numbers, and take over the shape alone; a whole simulator of which some
+        were replaced is refused. Raises `InputError` then, and for a snapshot of another simulator."""
+        if not isinstance(snapshot, Snapshot):
+            raise InputError(f"the snapshot is {shown(snapshot)}; give what Simulator.snapshot() returned.")
         memories = [link.memory for link in self._chain.links]
-        n_rows = len(self._layout.row_tendon)
-        check_snapshot(snapshot, self.n_robots, n_rows, memories, self._engine is not None)
+        self._rods.check(snapshot.memory)
+        check_snapshot(snapshot, memories, self._engine is not None)
         mask = None if rows is None else robot_mask(rows, self.n_robots)
         self._shaped[slice(None) if mask is None else mask] = True
         if mask is not None and self._state is not None and self._ports is not None:
@@ -239,10 +172,10 @@ class Statics:
             a is not b for a, b in zip(snapshot.robots, self.robots, strict=True)
         ):
             raise InputError("the snapshot is of other robots; some were replaced since.")
-        self._passes.memory = copied(snapshot.memory)
         self._derived = None
         self._warm, self._given, self._ports = snapshot.warm.copy(), snapshot.given, snapshot.ports
-        self._state, self._passes.params, self._bare = snapshot.state, snapshot.params, snapshot.bare
+        self._state, self._params, self._bare = snapshot.state, snapshot.params, snapshot.bare
+        self._rods.restore(snapshot.memory, None, None, self._before)
         self._chain.time = snapshot.time.copy()
         for memory, then in zip(memories, snapshot.effects, strict=True):
             memory[:] = then
@@ -253,17 +186,13 @@ class Statics:
         if snapshot.state is None or snapshot.ports is None:
             self.reset(rows)
             return
-        then = self._passes.refit(snapshot.memory, len(ports.follower_force) > 0, snapshot.ports.tip_force)
-        self._passes.put(np.flatnonzero(rows), then)
         self._warm, self._derived = np.where(rows, snapshot.warm, self._warm), None
         self._ports = merge_arrays(ports, snapshot.ports, rows)
         if self._bare is not None and snapshot.bare is not None:
             self._bare = merge_arrays(self._bare, snapshot.bare, rows)
-            self._passes.params = merge_arrays(self._passes.params, snapshot.params, rows)
-        tracked = self._passes.tracks_force and not len(snapshot.memory.force_before)
-        if self._engine is None and tracked and _alike(ports, snapshot.ports):
-            # their gain knows no tip force yet, which moves by now: learned as `step` does
-            self._learn_force(np.flatnonzero(rows & snapshot.warm), self._ports)
+            self._params = merge_arrays(self._params, snapshot.params, rows)
+        then = Last(snapshot.warm, snapshot.ports, snapshot.state)
+        self._rods.restore(snapshot.memory, rows, self._acting(self._ports), then)
         for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
             link.memory[rows] = memory[rows]
         self._chain.time[rows] = snapshot.time[rows]
@@ -272,7 +201,9 @@ class Statics:
         problems = merge_problems(state.problems, snapshot.state.problems, rows)
         ok = np.where(rows, snapshot.state.ok, state.ok)
         passes = np.where(rows, snapshot.state.passes, state.passes)
-        self._return_state(merge_shape(state.as_shape(), snapshot.state, rows), ok, passes, problems)
+        moving = {name: getattr(state, name) for name in (*MOVING, "step_error", "mean_wrench")}
+        moving |= _merged(moving, snapshot.state, rows)
+        self._return_state(merge_shape(state.as_shape(), snapshot.state, rows), ok, passes, problems, moving)
 
     def replace(self, rows: ArrayLike, robots: Sequence[Robot]) -> None:
         """Other robots in these rows (indices, one robot each): their numbers and the values of their
@@ -296,8 +227,7 @@ class Statics:
         ):
             raise RobotError("a robot has segments of another length; with a contact scene these must agree.")
 
-        self._plain = replace_arrays(self._plain, params, which, self.n_robots)
-        self._passes.params = self._plain
+        self._plain = self._params = replace_arrays(self._plain, params, which, self.n_robots)
         rest = replace_arrays(self._reader.rest, rest, which, self.n_robots)
         self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
         self._chain.gravity = replace_rows(self._chain.gravity, chain.gravity[1:], which, self.n_robots)
@@ -307,6 +237,7 @@ class Statics:
         for i, robot in zip(which, robots, strict=True):
             every[i] = robot
         self.robots = tuple(every)
+        self._rods.replace(self.robots)
         self.reset(mask)
         self._shaped[which] = False
 
@@ -315,7 +246,7 @@ class Statics:
         the same inputs once more, the tip now elsewhere."""
         compliance = None
         if self._chain.feels_tip:
-            compliance = self._tip_compliance() if again else self._step_compliance()
+            compliance = self._tip_compliance(in_step=not again)
         self._derived = None
         ports = self._reader.ports(given)
         self._given = given
@@ -324,9 +255,9 @@ class Statics:
         some_out = bool(out.any())
         rows = np.flatnonzero(~out) if some_out else self._all
         if self._chain:
-            bare, params = self._bare, self._passes.params
+            bare, params = self._bare, self._params
             self._bare = ports
-            ports, self._passes.params, points = self._chain.act(
+            ports, self._params, points = self._chain.act(
                 ports,
                 self._plain,
                 self._state,
@@ -344,7 +275,7 @@ class Statics:
                 rows = np.flatnonzero(~out)
             if only is not None and bare is not None:
                 self._bare = merge_arrays(self._bare, bare, ~only)
-                self._passes.params = merge_arrays(self._passes.params, params, ~only)
+                self._params = merge_arrays(self._params, params, ~only)
         # who is left out stays where it was, as extended as its boundary is, and its force does not move
         if some_out:
             if (then := self._ports) is None:
@@ -359,24 +290,14 @@ class Statics:
                 name: np.where(out[:, None], value, getattr(ports, name)) for name, value in kept.items()
             }
             ports = ports._replace(**{name: np.ascontiguousarray(a) for name, a in merged.items()})
-        track_force = self._passes.tracks_force or self._chain.pulls_tip or self._force_moves(ports.tip_force)
-        self._passes.remember(
-            len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force
-        )
+        self._rods.remember(ports, self._chain.pulls_tip, self._before)
         return ports, rows
 
-    def _step_compliance(self) -> Floats | None:
-        """Return how the tip gives to a force within a step."""
-        return self._tip_compliance()
-
-    def _tip_compliance(self) -> Floats | None:
+    def _tip_compliance(self, *, in_step: bool) -> Floats | None:
         """(n_robots, 3, 3) how the tip gives to a force, world [m/N]; None before the first state."""
         if self._state is None or self._ports is None or not self._warm.any():
             return None
-        kept = copied(self._passes.peek())  # a step goes on as if nobody had looked
-        by_force = np.asarray(self._linear(self._ports).by_force())[:, :3]
-        self._passes.memory = kept
-        return by_force
+        return self._rods.tip_compliance(self._acting(self._ports), self._warm, in_step=in_step)
 
     def _balanced(self, given: Inputs, state: State, tolerance: float, only: Flags | None) -> State:
         """The same settled again until effects that follow the rod are those of where it is."""
@@ -393,31 +314,9 @@ class Statics:
         self._state = replace(state, ok=state.ok & ~lost, problems=dict(state.problems) | problems)
         return self._state
 
-    def _keeps_jacobian(self, learns: bool) -> Flags:
-        """(n_robots,) these correct the boundary by the gain that they have."""
-        if not self.kept_jacobian_tolerance or learns or self._state is None or self._passes.propagate:
-            return np.zeros(self.n_robots, bool)
-        return np.asarray(self._warm & (self._state.residual < self.kept_jacobian_tolerance))
-
-    def _force_moves(self, force: Floats) -> bool:
-        """The tip force of a running robot changes: from now on the gain for it is worth its three
-        columns."""
-        if self._ports is None or not self._warm.any():
-            return False
-        before = self._ports.tip_force
-        same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
-        return not same and bool(
-            (force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any()
-        )
-
     def _linear(self, ports: Ports) -> Any:
         """The linear response of the last state."""
-        rows = np.flatnonzero(self._warm)
-        if self._felt is None:
-            return Linear(self._passes, rows, ports)
-        most = int(self._felt.contact_set.used[rows].max(initial=0))
-        loads = empty_loads(len(rows), most + 1, self._passes.n_x)
-        return Linear(self._passes, rows, self._felt.held(rows, ports, loads), loads)
+        return self._rods.response(self._acting(ports), self._warm)
 
     def _relocated(self, extension: Floats) -> dict[str, Floats]:
         """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over
@@ -431,41 +330,32 @@ class Statics:
 
     def _move_obstacles(self, moved: tuple[Any, Any] | None) -> None:
         if self._engine is not None and moved is not None:
-            self._engine.poses_before = self._engine.poses
+            if self._felt is None:
+                self._engine.poses_before = self._engine.poses
             self._engine.move(*moved, self.dt)
 
-    def _sentence(self, reason: str, kind: Problem, ports: Ports, shape: RodShape, i: int) -> ProblemSentence:
-        if overloaded(self._passes, ports, i):
-            kind = Problem.OVERLOADED
-        text = f"{reason}; residual {shape.residual[i]:.3g} m; {what_to_do(self._passes, ports, i)}."
-        return ProblemSentence(text, kind)
-
-    def _finish(
-        self,
-        ports: Ports,
-        shape: RodShape,
-        ok: Flags,
-        passes: Ints,
-        reason: str,
-        kind: Problem,
-        lost: Ints,
-        only: Flags | None = None,
-    ) -> State:
-        """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of
-        the robots `lost` is no shape of theirs: they keep the one before."""
+    def _note(self, solved: Solved, rows: Ints, only: Flags | None = None) -> State:
+        """Note who is not ok, so that nothing continues on NaN, and hand out the state. Robots that are lost
+        keep the shape before: what a pass wrote of them is none of theirs."""
+        shape, ok, ports, self._derived = solved.shape, solved.ok, solved.ports, solved.jacobian
+        passes = solved.passes if only is None else np.where(only, solved.passes, 0)
+        moving = dict(solved.moving)
+        if moving and self._state is not None and not ok.all():
+            moving |= _merged(moving, self._state, ~ok)
+        for i, why in solved.problems.items():
+            self._reader.problems.setdefault(i, why)
         problems = dict(self._reader.problems)
-        solved = (
-            ok if self._felt is None else ok & ~self._felt.continued
-        )  # what touches something is held by it
-        if len(fallen := self._unstable(ports, shape, np.flatnonzero(solved))):
+        lost = rows[~ok[rows]] if solved.lost is None else solved.lost
+        acting = self._acting(ports)
+        if len(fallen := self._rods.unstable(acting, shape, np.flatnonzero(ok))):
             ok, passes, self._derived = ok.copy(), np.array(passes), None
             ok[fallen], passes[fallen] = False, -1
             lost = np.union1d(lost, fallen)
-            problems |= {
-                int(i): self._sentence(_UNSTABLE, Problem.OVERLOADED, ports, shape, int(i)) for i in fallen
-            }
-        for i in np.flatnonzero(~ok):
-            problems.setdefault(int(i), self._sentence(reason, kind, ports, shape, int(i)))
+            for i in map(int, fallen):
+                problems[i] = sentence_of(_UNSTABLE, Problem.OVERLOADED, self._params, ports, shape, i)
+        for i in map(int, np.flatnonzero(~ok)):
+            if i not in problems:
+                problems[i] = sentence_of(solved.reason, solved.kind, self._params, ports, shape, i)
         if len(lost):
             last = None if self._state is None or self._ports is None else (self._state, self._ports)
             shape, ports = keep_lost(shape, ports, np.isin(self._all, lost), self._shaped, last)
@@ -488,19 +378,21 @@ class Statics:
             if self._ports is not None:
                 ports = merge_arrays(ports, self._ports, ~only)
         self._ports = ports
-        return self._return_state(shape, ok, passes, problems)
+        if solved.held is not None:  # they stand where they came to, and go on from there
+            self._warm[solved.held] = True
+        return self._return_state(shape, ok, passes, problems, moving)
 
-    def _unstable(self, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
-        """Those of `rows` whose shape balances its loads, but would not stay."""
-        return unstable(self._passes, ports, shape, rows)
-
-    def _return_state(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
+    def _return_state(
+        self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str], moving: Mapping[str, Any]
+    ) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)
         if self._engine is not None and self._felt is None:
             self._engine.before = shape
         if self.outputs == "tip":  # contact needs the whole rod, the caller did not ask for it
             shape = shape._replace(**{name: getattr(shape, name)[:0] for name in _ALONG})
-        self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems, contacts=contacts)
+        self._state = State(
+            **shape._asdict(), ok=ok, passes=passes, problems=problems, contacts=contacts, **moving
+        )
         return self._state
 
     def _last(self, what: str) -> tuple[State, Ports]:
@@ -509,6 +401,9 @@ class Statics:
         return self._state, self._ports
 
 
-def _alike(one: Ports, other: Ports) -> bool:
-    """Both have a follower force, or neither has."""
-    return bool(len(one.follower_force)) == bool(len(other.follower_force))
+def _merged(moving: Mapping[str, Any], then: State, rows: Flags) -> dict[str, Any]:
+    """What rods have in motion, with `rows` as in another state."""
+    if then.velocity is None:
+        return {}
+    pairs = {name: (moving[name], getattr(then, name)) for name in MOVING}
+    return {name: b if a is None else merge_rows(a, b, rows) for name, (a, b) in pairs.items()}
