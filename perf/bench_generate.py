@@ -22,8 +22,7 @@ import fastrod
 from fastrod.generation import Plan, Shapes, generate, read_plan
 from fastrod.generation.here import cores, one_thread
 from fastrod.generation.plan import SHARDS
-from fastrod.generation.settling import ChainSolver
-from fastrod.generation.shapes import Draw
+from fastrod.generation.shapes import ChainSolver, Draw
 from fastrod.generation.shards import counted, found, write
 from fastrod.generation.tasks import columns_of
 from fastrod.model.robotfile import dumps

@@ -56,7 +56,7 @@ ALLOWED: dict[str, str] = {
     "viewer/fastrod_viewer/app.py": "show_share_button",
     "viewer/fastrod_viewer/drive_page.py": "HAND_STOP",
     "viewer/fastrod_viewer/export.py": "feed",
-    "viewer/fastrod_viewer/inbox.py": "FileTransferPart",
+    "viewer/fastrod_viewer/server.py": "FileTransferPart",
     "fastrod/identification/log/noise.py": "stride_tricks",
     "gym_envs/fastrod_envs/page.py": "show_share_button",
     "device/fastrod_device/seal.py": "__slots__",

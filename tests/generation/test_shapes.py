@@ -11,8 +11,7 @@ from scipy.stats import kstest
 
 import fastrod
 from fastrod.generation import Plan, Shapes
-from fastrod.generation.settling import ChainSolver
-from fastrod.generation.shapes import LONGEST_CHAIN, STEP_ANGLE, Draw
+from fastrod.generation.shapes import LONGEST_CHAIN, STEP_ANGLE, ChainSolver, Draw
 from fastrod.generation.tasks import columns_of
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import dumps

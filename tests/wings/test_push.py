@@ -7,7 +7,7 @@ from bullets import carrier, clearance_of, cube, empty_world, soft_robot
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import HostError, InputError, UnknownNameError
 from fastrod.hosts import MountedRod
-from fastrod.hosts.surroundings import BulletBodyContact
+from fastrod.hosts.mounted import BulletBodyContact
 from fastrod.simulator import Simulator
 
 

@@ -20,8 +20,7 @@ from fastrod_scenes.scene import names
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.catalogue import labels, open_world
 from fastrod_viewer.drive_page import DrivePage
-from fastrod_viewer.holder import Holder
-from fastrod_viewer.holder_panel import HolderPanels
+from fastrod_viewer.holder import Holder, HolderPanels
 from fastrod_viewer.page import ViewerPage, is_upright, notify, plain
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage

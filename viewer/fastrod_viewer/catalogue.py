@@ -93,7 +93,7 @@ def open_world(name: str | Path | Robot) -> World:
         if isinstance(scene, RodScene):
             return SceneWorld(scene)
         if isinstance(scene, MujocoScene):
-            from fastrod_viewer.mujoco_view import MujocoView
+            from fastrod_viewer.hosted import MujocoView
 
             return MujocoView(scene)
         assert isinstance(scene, HostedScene)
