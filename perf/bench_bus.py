@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from fastrod.types import Floats
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.drive import DriveBus
-from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.pacer import Pacer, ordinary, urgent
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.can.drive import DriveBus
+from fastrod_device.can.pacer import Pacer, ordinary, urgent
+from fastrod_device.emulator.nodes import EmulatedDrives
 from fastrod_device.units import DriveSpec
 from report import Measurement, Row, Section, bench, note_progress, table
 

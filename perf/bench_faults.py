@@ -24,21 +24,21 @@ import numpy as np
 
 from fastrod.logs.recording import recover
 from fastrod.types import Floats
-from fastrod_device.bus import BusLine
-from fastrod_device.camera import CameraFrame
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.dictionary import object_dictionary
-from fastrod_device.drawing import Eye
-from fastrod_device.emulator import Emulator
+from fastrod_device.bench.workbench import emulated
+from fastrod_device.can.bus import BusLine
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.can.dictionary import object_dictionary
+from fastrod_device.can.faultcodes import ENABLED
+from fastrod_device.can.pacer import urgent
+from fastrod_device.emulator.emulator import Emulator
+from fastrod_device.emulator.seal import seal
 from fastrod_device.errors import DeviceError, RefusedError
-from fastrod_device.faultcodes import ENABLED
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
-from fastrod_device.pacer import urgent
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
-from fastrod_device.seal import seal
-from fastrod_device.workbench import emulated
+from fastrod_device.vision.camera import CameraFrame
+from fastrod_device.vision.drawing import Eye
 from report import Row, Section, bench, note_progress, table
 
 RADIUS, PERIOD = 0.0025, 1.0  # m of tendon, s

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from fastrod_device.bench.loop import close_loop
+from fastrod_device.bench.workbench import emulated
 from fastrod_device.hardware import load_hardware
-from fastrod_device.loop import close_loop
-from fastrod_device.workbench import emulated
 from report import Row, Section, bench, note_progress, table
 
 FLOOR_TARGET, BEYOND_TARGET, FRACTION_TARGET = 1.3, 0.7, 0.5

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from fastrod.errors import InputError
-from fastrod_device.clock import SteppedClock
-from fastrod_device.drive import DriveBus
-from fastrod_device.emulator import Emulator
-from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.pacer import Pacer
+from fastrod_device.can.clock import SteppedClock
+from fastrod_device.can.drive import DriveBus
+from fastrod_device.can.pacer import Pacer
+from fastrod_device.emulator.emulator import Emulator
+from fastrod_device.emulator.nodes import EmulatedDrives
+from fastrod_device.emulator.seal import seal
 from fastrod_device.prototype import Prototype
-from fastrod_device.seal import seal
 
 BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 """m of tendon, that bend the prototype."""
@@ -87,8 +87,8 @@ def started(hardware, clock=None, *, camera=True, home=False, change=None, journ
     clock, bus = clock or SteppedClock(), own_bus()
     with pytest.MonkeyPatch.context() as patch:
         if not clock.stepped:  # drives that bear a busy machine, too
-            patch.setattr("fastrod_device.configuring.PATIENCE", 8.0)
-            patch.setattr("fastrod_device.cycle._PAUSE", 7.0)
+            patch.setattr("fastrod_device.can.configuring.PATIENCE", 8.0)
+            patch.setattr("fastrod_device.can.cycle._PAUSE", 7.0)
         emulator = Emulator(hardware, bus, clock=clock, seal=seal(5, "none"), seed=5, taut=not home)
         try:
             source = None if not camera else emulator if change is None else Changed(emulator, change)

@@ -15,13 +15,13 @@ from fastrod import load_robot
 from fastrod.commands.arguments import ACTIONS
 from fastrod.commands.cli import main
 from fastrod.logs.runlog import read_log
-from fastrod_device import boards, workbench
-from fastrod_device.calibration import CharucoBoard
-from fastrod_device.camera import CameraFrame, load_camera
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.emulator import Emulator
+from fastrod_device.bench import boards, workbench
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.emulator.emulator import Emulator
 from fastrod_device.errors import CalibrationError
 from fastrod_device.hardware import SHIPPED, load_hardware
+from fastrod_device.vision.calibration import CharucoBoard
+from fastrod_device.vision.camera import CameraFrame, load_camera
 
 pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 EASY, LATE, TAUT = "3", "7", "--no-home"  # seeds: gravity is hidden; a latency is

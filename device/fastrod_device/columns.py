@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from fastrod_device.gates import AHEAD, ASTRAY, BACK, FROZEN, OUTSIDE, REPEATED, TOO_FAST, TWICE
 from fastrod_device.readings import Readings
-from fastrod_device.tracker import MarkerSighting
+from fastrod_device.vision.gates import AHEAD, ASTRAY, BACK, FROZEN, OUTSIDE, REPEATED, TOO_FAST, TWICE
+from fastrod_device.vision.tracker import MarkerSighting
 
 _REFUSED = (FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
 FLAGS = ("", "no marker", "outlier", "ambiguous", *_REFUSED)

@@ -15,18 +15,18 @@ from typing import Any, Protocol
 
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.types import Ints
-from fastrod_device.clock import Clock
+from fastrod_device.can.clock import Clock
 from fastrod_device.readings import DriveFeedback
 from fastrod_device.units import DriveSpec
 
 GROUP = "fastrod.drives"
 _DRIVERS: Mapping[str, str] = {
-    "epos4": "fastrod_device.drive:DriveBus",
-    "dynamixel": "fastrod_device.dynamixel:DynamixelBus",
+    "epos4": "fastrod_device.can.drive:DriveBus",
+    "dynamixel": "fastrod_device.dynamixel.drives:DynamixelBus",
 }
 _EMULATORS: Mapping[str, str] = {
-    "epos4": "fastrod_device.nodes:EmulatedDrives",
-    "dynamixel": "fastrod_device.dynamixel_emulator:EmulatedDynamixels",
+    "epos4": "fastrod_device.emulator.nodes:EmulatedDrives",
+    "dynamixel": "fastrod_device.emulator.dynamixel:EmulatedDynamixels",
 }
 _SLOWEST, _QUICKEST = 9600, 10_000_000  # bit/s
 

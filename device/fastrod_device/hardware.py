@@ -14,10 +14,10 @@ from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.loading import load_robot
 from fastrod.model.robot import Robot
 from fastrod.tomlfile import parse, read_text
-from fastrod_device.camera import Camera, Marker, from_table, load_camera
 from fastrod_device.drives import BusSpec
 from fastrod_device.safety import Limits
 from fastrod_device.units import DriveSpec, Transmission
+from fastrod_device.vision.camera import Camera, Marker, from_table, load_camera
 
 SHIPPED = Path(str(files("fastrod_device") / "prototype.toml"))
 """The hardware file that ships: the paper's prototype."""

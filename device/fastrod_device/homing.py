@@ -21,15 +21,15 @@ import numpy as np
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Floats
-from fastrod_device.clock import Clock
+from fastrod_device.can.clock import Clock
+from fastrod_device.can.faultcodes import ENABLED, in_words, state_in_words
+from fastrod_device.can.pacer import Pacer
 from fastrod_device.drives import Drives
 from fastrod_device.errors import DeviceError
-from fastrod_device.faultcodes import ENABLED, in_words, state_in_words
 from fastrod_device.hardware import Hardware
-from fastrod_device.pacer import Pacer
 from fastrod_device.readings import DriveFeedback
-from fastrod_device.tracker import MarkerSighting
 from fastrod_device.units import Transmission
+from fastrod_device.vision.tracker import MarkerSighting
 
 ZERO_SD = 2e-5
 """Standard deviation of the tendons' zeros after homing by camera: 0.1 mm at the tip, a fifth of it in the

@@ -21,21 +21,21 @@ from fastrod.logs.recording import Recorder
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 from fastrod_device import columns
-from fastrod_device.camera import CameraFrame, FrameSource
-from fastrod_device.clock import Clock, WallClock
+from fastrod_device.can.clock import Clock, WallClock
+from fastrod_device.can.faultcodes import in_words
+from fastrod_device.can.pacer import Pacer, urgent, urgently
 from fastrod_device.drives import Drives, open_drives
 from fastrod_device.errors import DeviceError, RefusedError
-from fastrod_device.faultcodes import in_words
-from fastrod_device.gates import FROZEN, REPEATED, Expectation, Workspace
 from fastrod_device.hardware import Hardware
 from fastrod_device.homing import home
 from fastrod_device.journal import Journal
-from fastrod_device.pacer import Pacer, urgent, urgently
 from fastrod_device.readings import Readings, Trace
 from fastrod_device.safety import CameraWatch, Fault, SafetyState, Supervisor, limited
 from fastrod_device.safety_words import of_exception
-from fastrod_device.tracker import MarkerSighting, MarkerTracker, outlined
 from fastrod_device.units import Transmission
+from fastrod_device.vision.camera import CameraFrame, FrameSource
+from fastrod_device.vision.gates import FROZEN, REPEATED, Expectation, Workspace
+from fastrod_device.vision.tracker import MarkerSighting, MarkerTracker, outlined
 
 Plan = Callable[[float], Floats]
 """Seconds since it began -> (n_tendons,) changes of tendon length [m], negative = pulled."""

@@ -19,7 +19,7 @@ from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Floats
-from fastrod_device.clock import Clock
+from fastrod_device.can.clock import Clock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited
 from fastrod_device.readings import Readings

@@ -127,10 +127,10 @@ def _waiting(why: str) -> AbstractContextManager[object]:
 
 
 def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: bool) -> None:
-    from fastrod_device import loop_report
+    from fastrod_device.bench import report as loop_report
+    from fastrod_device.bench.loop import close_loop
+    from fastrod_device.bench.workbench import emulated
     from fastrod_device.hardware import load_hardware
-    from fastrod_device.loop import close_loop
-    from fastrod_device.workbench import emulated
 
     console.print(
         "\n[bold]An emulated prototype[/]: four CiA 402 drives on a virtual CAN bus, a camera whose frames "

@@ -21,11 +21,11 @@ from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 if TYPE_CHECKING:
-    from fastrod_device.calibration import CameraCalibration, CharucoBoard, MarkerRegistration
-    from fastrod_device.camera import Camera
-    from fastrod_device.experiment import Law, Progress
+    from fastrod_device.bench.experiment import Law, Progress
+    from fastrod_device.bench.workbench import BoardBench, EmulatedBench
     from fastrod_device.hardware import Hardware
-    from fastrod_device.workbench import BoardBench, EmulatedBench
+    from fastrod_device.vision.calibration import CameraCalibration, CharucoBoard, MarkerRegistration
+    from fastrod_device.vision.camera import Camera
 
 DONE = 0
 _SWITCHES = 1e-3  # s: the thread of the drives waits no longer for one that draws
@@ -40,10 +40,10 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     import signal
     import sys
 
-    from fastrod_device.pacer import ordinary, urgent
+    from fastrod_device.can.pacer import ordinary, urgent
     from fastrod_viewer.app import view
     from fastrod_viewer.server import serve
-    from fastrod_viewer.worlds import FreeWorld
+    from fastrod_viewer.worlds.simulated import FreeWorld
 
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
@@ -90,7 +90,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
 def _excite(arguments: argparse.Namespace, progress: Progress | None) -> int:
     """The run that separates effects, recorded."""
     from fastrod.identification.excite import excitation
-    from fastrod_device.experiment import excite
+    from fastrod_device.bench.experiment import excite
 
     hardware = _hardware(arguments)
     out = _recorded(arguments.out or Path("excite.csv"), hardware)
@@ -109,9 +109,9 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
     from rich.console import Console
 
     from fastrod.control import references
-    from fastrod_device.experiment import follow, tracking
-    from fastrod_device.loop import APPROACH, planned
-    from fastrod_device.loop_report import tracking_table
+    from fastrod_device.bench.experiment import follow, tracking
+    from fastrod_device.bench.loop import APPROACH, planned
+    from fastrod_device.bench.report import tracking_table
 
     hardware, name = _hardware(arguments), arguments.path or "circle"
     known = references(hardware.robot.length)
@@ -147,8 +147,8 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
     from rich.console import Console
 
     from fastrod.logs.folder import make_folder
-    from fastrod_device.loop import close_loop
-    from fastrod_device.loop_report import show, write
+    from fastrod_device.bench.loop import close_loop
+    from fastrod_device.bench.report import show, write
 
     hardware, out = _hardware(arguments), arguments.out or Path("loop")
     if out.is_dir() and any(path.name != _EVENTS for path in out.iterdir()):
@@ -170,9 +170,9 @@ def _calibrate(arguments: argparse.Namespace, progress: Progress | None) -> int:
     """Calibrate the lens from pictures of a board that is waved."""
     from rich.console import Console
 
-    from fastrod_device.boards import collect, lens_table
-    from fastrod_device.calibration import calibrate
-    from fastrod_device.camera import save_camera
+    from fastrod_device.bench.boards import collect, lens_table
+    from fastrod_device.vision.calibration import calibrate
+    from fastrod_device.vision.camera import save_camera
 
     hardware, board, out = (
         _hardware(arguments),
@@ -195,9 +195,9 @@ def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
     """Calibrate the camera's pose from pictures of a board at known places."""
     from rich.console import Console
 
-    from fastrod_device.boards import collect, fixtures, place_table
-    from fastrod_device.calibration import register_base
-    from fastrod_device.camera import save_camera
+    from fastrod_device.bench.boards import collect, fixtures, place_table
+    from fastrod_device.vision.calibration import register_base
+    from fastrod_device.vision.camera import save_camera
 
     hardware, board, out = (
         _hardware(arguments),
@@ -230,8 +230,8 @@ def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
 
 def _latency(arguments: argparse.Namespace, _: Progress | None) -> int:
     """Measure the camera's latency from a motion of some seconds."""
-    from fastrod_device.camera import save_camera
-    from fastrod_device.latency import measure_latency
+    from fastrod_device.bench.latency import measure_latency
+    from fastrod_device.vision.camera import save_camera
 
     hardware, out = _hardware(arguments), None if arguments.out is None else _camera_file(arguments.out)
     with _bench(arguments, hardware) as bench:
@@ -278,7 +278,7 @@ def _bench(
 ) -> Iterator[EmulatedBench]:
     import sys
 
-    from fastrod_device import workbench
+    from fastrod_device.bench import workbench
 
     events = (
         None
@@ -312,7 +312,7 @@ def _board_bench(
     arguments: argparse.Namespace, camera: Camera, board: CharucoBoard, *, lens: bool
 ) -> Iterator[BoardBench]:
     """Emulated, what is hidden is the lens, or else where the camera stands."""
-    from fastrod_device import workbench
+    from fastrod_device.bench import workbench
 
     if arguments.emulate:
         with workbench.emulated_board(
@@ -380,7 +380,7 @@ def _device(arguments: argparse.Namespace) -> int | str | None:
 
 
 def _board(arguments: argparse.Namespace) -> CharucoBoard:
-    from fastrod_device.calibration import CharucoBoard
+    from fastrod_device.vision.calibration import CharucoBoard
 
     columns, rows = arguments.board or (7, 5)
     square = 0.02 if arguments.square is None else arguments.square

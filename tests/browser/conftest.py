@@ -48,7 +48,7 @@ def chromium() -> Iterator[Any]:
 def _slow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a graphics card, and on one core, a browser takes seconds to answer."""
     monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 30.0)
-    monkeypatch.setattr("fastrod_viewer.session._SAID", PATIENCE)
+    monkeypatch.setattr("fastrod_viewer.drive.session._SAID", PATIENCE)
 
 
 @pytest.fixture

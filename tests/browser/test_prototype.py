@@ -19,12 +19,12 @@ from pages import DRIVE
 from windows import PATIENCE, Window
 
 from fastrod.logs.runlog import read_log
+from fastrod_device.bench.workbench import EmulatedBench, emulated
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
-from fastrod_device.workbench import EmulatedBench, emulated
 from fastrod_viewer.app import App
-from fastrod_viewer.drive_page import DrivePage
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.drive.page import DrivePage
+from fastrod_viewer.worlds.simulated import FreeWorld
 
 Windows = Callable[..., Window]
 FREEZE = "() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }"
@@ -194,7 +194,7 @@ def test_stop_only_stops_however_often_it_is_pressed(bed, window, monkeypatch):
         assert each.button("Resume").is_disabled()
     bed.slowly(seen)
     with monkeypatch.context() as patch:
-        patch.setattr("fastrod_viewer.session._HASTY", PATIENCE)  # a click may need a second
+        patch.setattr("fastrod_viewer.drive.session._HASTY", PATIENCE)  # a click may need a second
         seen.button("STOP").dblclick()
         assert seen.until(lambda: bed.page.session.stopped)
         seen.button("Resume").click()

@@ -12,10 +12,10 @@ import fastrod
 from fastrod.identification.log.replay import replay
 from fastrod.logs.runlog import read_log
 from fastrod_viewer.app import DEMO_LOG, App
-from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.drive.page import DrivePage
 from fastrod_viewer.export import external_references
-from fastrod_viewer.playback import load
-from fastrod_viewer.replay_page import ReplayPage
+from fastrod_viewer.replay.page import ReplayPage
+from fastrod_viewer.replay.playback import load
 
 Windows = Callable[..., Window]
 

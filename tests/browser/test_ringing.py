@@ -11,8 +11,8 @@ from windows import Window
 
 import fastrod
 from fastrod_viewer.app import App
-from fastrod_viewer.drive_page import DrivePage
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.drive.page import DrivePage
+from fastrod_viewer.worlds.simulated import FreeWorld
 
 LENGTH = 0.3
 

@@ -21,9 +21,9 @@ from fastrod.errors import InputError
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robotfile import load_robot
 from fastrod_viewer.app import DEMO_LOG, App
-from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.drive.page import DrivePage
 from fastrod_viewer.holder import AGAIN, IDLE, PATIENCE, Holder
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.worlds.simulated import FreeWorld
 
 
 @pytest.fixture(scope="module", params=["viewer", "replay", "drive", "environments"])
@@ -367,7 +367,7 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
 def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = load_robot("prototype")
     link = SimulatedRobot(robot, real=True)
-    monkeypatch.setattr("fastrod_viewer.session._HASTY", 0.0)
+    monkeypatch.setattr("fastrod_viewer.drive.session._HASTY", 0.0)
     app.open(FreeWorld(robot), link=link)
     page, bend, other = page_of(app), slider(app, "Bend x [°]"), slider(app, "Bend y [°]")
     one, two = RawPage(app), RawPage(app)

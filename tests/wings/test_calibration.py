@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 
 from fastrod.errors import InputError
 from fastrod.rotation import product, quaternion_from_vector
-from fastrod_device.calibration import CharucoBoard, calibrate, register_base
-from fastrod_device.camera import Camera, compose, rotation
-from fastrod_device.drawing import DrawnScene, draw_board
+from fastrod_device.bench.latency import estimate_latency
 from fastrod_device.errors import CalibrationError
-from fastrod_device.latency import estimate_latency
+from fastrod_device.vision.calibration import CharucoBoard, calibrate, register_base
+from fastrod_device.vision.camera import Camera, compose, rotation
+from fastrod_device.vision.drawing import DrawnScene, draw_board
 
 BOARD = CharucoBoard(columns=7, rows=5, square=0.02, marker=0.015, dictionary="DICT_4X4_50")
 LENS = (-0.2, 0.08, 0.001, -0.0005, 0.0)

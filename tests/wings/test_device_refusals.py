@@ -10,25 +10,25 @@ from benches import BusBench, Springs
 from fastrod import Robot, Segment
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.model.robotfile import load_robot
-from fastrod_device.bus import open_bus
-from fastrod_device.calibration import CharucoBoard, calibrate, register_base
-from fastrod_device.camera import Camera, CameraFrame, Marker, load_camera
-from fastrod_device.clock import SteppedClock
-from fastrod_device.dictionary import object_dictionary
-from fastrod_device.drawing import DrawnScene
-from fastrod_device.drive import DriveBus
+from fastrod_device.can.bus import open_bus
+from fastrod_device.can.clock import SteppedClock
+from fastrod_device.can.dictionary import object_dictionary
+from fastrod_device.can.drive import DriveBus
+from fastrod_device.can.pacer import Pacer
+from fastrod_device.emulator.nodes import EmulatedDrives
+from fastrod_device.emulator.plant import Plant
+from fastrod_device.emulator.plant_rod import PlantRod
+from fastrod_device.emulator.seal import seal
 from fastrod_device.errors import CalibrationError, DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.limits import Limits, limited
-from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.pacer import Pacer
-from fastrod_device.plant import Plant
-from fastrod_device.plant_rod import PlantRod
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import Fault, Supervisor
-from fastrod_device.seal import seal
-from fastrod_device.tracker import MarkerTracker
 from fastrod_device.units import DriveSpec
+from fastrod_device.vision.calibration import CharucoBoard, calibrate, register_base
+from fastrod_device.vision.camera import Camera, CameraFrame, Marker, load_camera
+from fastrod_device.vision.drawing import DrawnScene
+from fastrod_device.vision.tracker import MarkerTracker
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")

@@ -10,14 +10,14 @@ import pytest
 from benches import BusBench, Springs, own_bus
 
 from fastrod.errors import InputError
-from fastrod_device.bus import open_bus
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.dictionary import object_dictionary
-from fastrod_device.drive import DriveBus
+from fastrod_device.can.bus import open_bus
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.can.dictionary import object_dictionary
+from fastrod_device.can.drive import DriveBus
+from fastrod_device.can.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
+from fastrod_device.can.pacer import Pacer, urgently
+from fastrod_device.emulator.nodes import EmulatedDrives
 from fastrod_device.errors import DeviceError
-from fastrod_device.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
-from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.pacer import Pacer, urgently
 from fastrod_device.units import DriveSpec, Transmission
 
 canopen = pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")

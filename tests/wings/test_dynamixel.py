@@ -15,18 +15,18 @@ from benches import BENT, Springs, started
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError
 from fastrod.logs.link import RobotLink
-from fastrod_device.clock import SteppedClock, WallClock
+from fastrod_device.can.clock import SteppedClock, WallClock
 from fastrod_device.drives import BusSpec, Drives, drive_kinds
-from fastrod_device.dynamixel import DynamixelBus
-from fastrod_device.dynamixel_emulator import EmulatedDynamixels
-from fastrod_device.dynamixel_line import CURRENT_LIMIT, GOAL_POSITION
-from fastrod_device.dynamixel_packets import EVERYBODY, PING, STATUS, SYNC_WRITE, WRITE, Packet, PacketReader
-from fastrod_device.emulator import Emulator
+from fastrod_device.dynamixel.drives import DynamixelBus
+from fastrod_device.dynamixel.line import CURRENT_LIMIT, GOAL_POSITION
+from fastrod_device.dynamixel.packets import EVERYBODY, PING, STATUS, SYNC_WRITE, WRITE, Packet, PacketReader
+from fastrod_device.emulator.dynamixel import EmulatedDynamixels
+from fastrod_device.emulator.emulator import Emulator
+from fastrod_device.emulator.seal import seal
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
-from fastrod_device.seal import seal
 from fastrod_device.units import DriveSpec
 
 COUNT = 2.0 * np.pi * 0.008 / 4096  # m, of a servo without a gear
@@ -312,7 +312,7 @@ def test_a_port_that_is_not_there_is_said(hardware):
         nowhere(eds="mine.eds")
 
 
-DRIVER = """from fastrod_device.dynamixel import DynamixelBus
+DRIVER = """from fastrod_device.dynamixel.drives import DynamixelBus
 def bus(specs, bus, *, clock, rate, bitrate):
     port = bus.replace('mine', 'virtual')
     return DynamixelBus(specs, port, clock=clock, rate=rate, bitrate=bitrate)
@@ -348,9 +348,9 @@ def test_a_serial_device_carries_it_too(monkeypatch):
     pytest.importorskip("serial", reason="pyserial is not installed: pip install 'fastrod[device]'")
     import tty
 
-    patience = {"_line._PATIENCE": 20.0, "._CYCLE": 20.0, "._SILENCE": 60.0, "._WATCHED": 0}
+    patience = {"line._PATIENCE": 20.0, "drives._CYCLE": 20.0, "drives._SILENCE": 60.0, "drives._WATCHED": 0}
     for name, value in patience.items():
-        monkeypatch.setattr(f"fastrod_device.dynamixel{name}", value)
+        monkeypatch.setattr(f"fastrod_device.dynamixel.{name}", value)
     master, slave = os.openpty()
     tty.setraw(slave)
     clock, done = WallClock(), threading.Event()

@@ -14,7 +14,7 @@ from benches import BusBench, Springs
 
 from fastrod.commands.drive import _bench
 from fastrod.errors import InputError
-from fastrod_device.dictionary import NEEDED, find, object_dictionary, read_eds
+from fastrod_device.can.dictionary import NEEDED, find, object_dictionary, read_eds
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.units import DriveSpec

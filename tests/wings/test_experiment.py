@@ -18,13 +18,13 @@ from fastrod.identification.excite import Excitation
 from fastrod.logs.runlog import RunLog, read_log
 from fastrod.model.routing import route
 from fastrod.types import Floats
+from fastrod_device.bench.experiment import excite, follow, tracking
+from fastrod_device.bench.latency import play, sweep
+from fastrod_device.bench.loop import APPROACH, planned
+from fastrod_device.bench.workbench import EmulatedBench, emulated
 from fastrod_device.errors import DeviceError, RefusedError
-from fastrod_device.experiment import excite, follow, tracking
 from fastrod_device.hardware import load_hardware
-from fastrod_device.latency import play, sweep
-from fastrod_device.loop import APPROACH, planned
 from fastrod_device.prototype import Prototype
-from fastrod_device.workbench import EmulatedBench, emulated
 
 ROBOT = load_robot("prototype")
 MASS = 0.01

@@ -18,16 +18,16 @@ import pytest
 
 from fastrod.logs.recording import recover
 from fastrod.types import Floats
-from fastrod_device.bus import BusLine
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.emulator import Emulator
+from fastrod_device.can.bus import BusLine
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.can.faultcodes import ENABLED
+from fastrod_device.emulator.emulator import Emulator
+from fastrod_device.emulator.seal import seal
 from fastrod_device.errors import DeviceError, RefusedError
-from fastrod_device.faultcodes import ENABLED
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
-from fastrod_device.seal import seal
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
@@ -310,13 +310,13 @@ def _heard(bus: object, frames: int) -> None:
 CHILD = """
 import sys, time
 import numpy as np
-from fastrod_device.camera import CameraFrame
-from fastrod_device.drawing import Eye
+from fastrod_device.vision.camera import CameraFrame
+from fastrod_device.vision.drawing import Eye
 from fastrod_device.hardware import load_hardware
 from fastrod_device.prototype import Prototype
 from dataclasses import replace
-import fastrod_device.configuring, fastrod_device.cycle
-fastrod_device.configuring.PATIENCE, fastrod_device.cycle._PAUSE = 1.0, 0.8
+import fastrod_device.can.configuring, fastrod_device.can.cycle
+fastrod_device.can.configuring.PATIENCE, fastrod_device.can.cycle._PAUSE = 1.0, 0.8
 hardware = load_hardware()
 limits = replace(hardware.limits, sighting_age=None, feedback_age=0.5, heartbeat_age=2.0, cycle=0.5)
 hardware = replace(hardware, limits=limits)

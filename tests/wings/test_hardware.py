@@ -9,10 +9,10 @@ import pytest
 from fastrod import load_robot
 from fastrod.errors import FastrodError, InputError, UnknownNameError
 from fastrod.model.robotfile import save_robot
-from fastrod_device.camera import save_camera
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_device.limits import Limits
 from fastrod_device.units import Transmission
+from fastrod_device.vision.camera import save_camera
 
 TEXT = SHIPPED.read_text(encoding="utf-8")
 START, END = TEXT.index("[camera]"), TEXT.index("[[drive]]")

@@ -8,16 +8,16 @@ import pytest
 from benches import own_bus
 
 from fastrod_device import homing
-from fastrod_device.clock import SteppedClock
-from fastrod_device.drive import DriveBus
-from fastrod_device.emulator import Emulator
+from fastrod_device.can.clock import SteppedClock
+from fastrod_device.can.drive import DriveBus
+from fastrod_device.emulator.emulator import Emulator
+from fastrod_device.emulator.seal import seal
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.homing import home, trouble
 from fastrod_device.readings import DriveFeedback, Emergency
-from fastrod_device.seal import seal
-from fastrod_device.tracker import MarkerTracker
 from fastrod_device.units import Transmission
+from fastrod_device.vision.tracker import MarkerTracker
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")

@@ -12,12 +12,12 @@ from fastrod.errors import InputError
 from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import read_log
 from fastrod.logs.simulated import SimulatedRobot
-from fastrod_viewer.controls import drive_controls
-from fastrod_viewer.drive_page import far_rows, fitted
-from fastrod_viewer.linked import Linked, TendonLimits
-from fastrod_viewer.session import Session
-from fastrod_viewer.teleop import Speeds, Teleop
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.drive.controls import drive_controls
+from fastrod_viewer.drive.linked import Linked, TendonLimits
+from fastrod_viewer.drive.page import far_rows, fitted
+from fastrod_viewer.drive.session import Session
+from fastrod_viewer.drive.teleop import Speeds, Teleop
+from fastrod_viewer.worlds.simulated import FreeWorld
 
 DT = 1.0 / 30.0
 ROBOT = fastrod.load_robot("prototype")

@@ -7,13 +7,13 @@ import time
 import pytest
 from benches import Springs, own_bus
 
-from fastrod_device.bus import open_bus
-from fastrod_device.clock import SteppedClock, WallClock
-from fastrod_device.dictionary import object_dictionary
+from fastrod_device.can.bus import open_bus
+from fastrod_device.can.clock import SteppedClock, WallClock
+from fastrod_device.can.dictionary import object_dictionary
+from fastrod_device.emulator.motor import Motor
+from fastrod_device.emulator.nodes import EmulatedDrives
+from fastrod_device.emulator.objects import Objects
 from fastrod_device.errors import DeviceError
-from fastrod_device.motor import Motor
-from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.objects import Objects
 from fastrod_device.units import DriveSpec
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")

@@ -18,11 +18,11 @@ from rods import rod
 from fastrod import Simulator
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion
-from fastrod_device import plant, plant_rod
+from fastrod_device.emulator import plant, plant_rod
+from fastrod_device.emulator.plant import Plant
+from fastrod_device.emulator.plant_rod import EI, LENGTH, OFFSET, PlantRod
+from fastrod_device.emulator.seal import KINDS, NAMES, Seal, seal
 from fastrod_device.errors import DeviceError
-from fastrod_device.plant import Plant
-from fastrod_device.plant_rod import EI, LENGTH, OFFSET, PlantRod
-from fastrod_device.seal import KINDS, NAMES, Seal, seal
 
 DOWN = np.array([0.0, 0.0, -1.0])
 STILL = np.zeros(3)
@@ -492,7 +492,7 @@ def test_the_plant_stands_alone() -> None:
         ]
         assert all("fastrod.errors" in line or "fastrod.types" in line for line in lines)
     code = (
-        "from fastrod_device.plant import Plant; from fastrod_device.seal import seal; "
+        "from fastrod_device.emulator.plant import Plant; from fastrod_device.emulator.seal import seal; "
         "Plant(seal(3)).tip(); print('quiet')"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

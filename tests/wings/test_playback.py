@@ -16,8 +16,8 @@ from fastrod.logs.runlog import RunLog, read_log, write_log
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import save_robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod_viewer.playback import BEFORE, POINTS_PER_SEGMENT, SWITCHED_OFF, Playback, identify, load
-from fastrod_viewer.residual_plot import curves, svg
+from fastrod_viewer.replay.playback import BEFORE, POINTS_PER_SEGMENT, SWITCHED_OFF, Playback, identify, load
+from fastrod_viewer.replay.residual_plot import curves, svg
 
 ROBOT = fastrod.load_robot("prototype")
 MEMORY = {"name": "backlash", "half_width": 3e-4}

@@ -17,13 +17,13 @@ from benches import started
 from fastrod.errors import InputError
 from fastrod.logs.link import RobotLink
 from fastrod.types import Floats
-from fastrod_device.clock import Clock, SteppedClock, WallClock
-from fastrod_device.emulator import Emulator
+from fastrod_device.bench.workbench import emulated
+from fastrod_device.can.clock import Clock, SteppedClock, WallClock
+from fastrod_device.emulator.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
-from fastrod_device.workbench import emulated
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")

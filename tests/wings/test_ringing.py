@@ -18,10 +18,10 @@ from fastrod.errors import InputError, RobotError
 from fastrod.loading import with_line_density
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.app import App, found_in_motion, view
-from fastrod_viewer.session import Session, ViewFrame
-from fastrod_viewer.teleop import Teleop
-from fastrod_viewer.world import ManualCommand
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.drive.session import Session, ViewFrame
+from fastrod_viewer.drive.teleop import Teleop
+from fastrod_viewer.worlds.simulated import FreeWorld
+from fastrod_viewer.worlds.world import ManualCommand
 
 LENGTH, STIFFNESS, DENSITY = 0.3, 0.01, 0.05
 # Clamped, free at its end: f = 1.8751^2 / (2 pi l^2) sqrt(EI / rho)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fastrod import Robot, Tendon
 from fastrod.errors import InputError
 from fastrod.model.robotfile import load_robot
-from fastrod_device.clock import SteppedClock
+from fastrod_device.can.clock import SteppedClock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited
 from fastrod_device.readings import Emergency, Readings

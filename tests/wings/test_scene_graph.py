@@ -12,9 +12,9 @@ import fastrod
 from fastrod.errors import InputError
 from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes import load
-from fastrod_viewer import palette
-from fastrod_viewer.curves import tangents
-from fastrod_viewer.scene_graph import (
+from fastrod_viewer.picture import palette
+from fastrod_viewer.picture.curves import tangents
+from fastrod_viewer.picture.scene_graph import (
     SHAPES,
     Picture,
     Trail,
@@ -25,7 +25,7 @@ from fastrod_viewer.scene_graph import (
     grid_places,
     legend,
 )
-from fastrod_viewer.world import Body, DrawnRods
+from fastrod_viewer.worlds.world import Body, DrawnRods
 
 
 def seen(robots, state, place=None):

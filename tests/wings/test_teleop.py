@@ -13,11 +13,11 @@ from fastrod.errors import InputError
 from fastrod.logs.link import Measurement, RobotLink
 from fastrod.logs.recording import Recorder
 from fastrod.logs.simulated import SimulatedRobot
-from fastrod_viewer.controls import drive_controls, largest_force, load_controls, nice
-from fastrod_viewer.session import Session
-from fastrod_viewer.teleop import LARGEST_BEND, Speeds, Teleop
-from fastrod_viewer.world import ManualCommand, measure
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.drive.controls import drive_controls, largest_force, load_controls, nice
+from fastrod_viewer.drive.session import Session
+from fastrod_viewer.drive.teleop import LARGEST_BEND, Speeds, Teleop
+from fastrod_viewer.worlds.simulated import FreeWorld
+from fastrod_viewer.worlds.world import ManualCommand, measure
 
 DT = 1.0 / 30.0
 

@@ -14,8 +14,9 @@ from fastrod.errors import InputError
 from fastrod.model.robot import Segment
 from fastrod.model.robotfile import load_robot
 from fastrod.rotation import product, quaternion_from_vector
-from fastrod_device import camera as camera_module
-from fastrod_device.camera import (
+from fastrod_device.errors import DeviceError
+from fastrod_device.vision import camera as camera_module
+from fastrod_device.vision.camera import (
     Camera,
     CameraFrame,
     Marker,
@@ -26,10 +27,9 @@ from fastrod_device.camera import (
     rotation,
     save_camera,
 )
-from fastrod_device.drawing import DrawnScene, Eye, draw, project
-from fastrod_device.errors import DeviceError
-from fastrod_device.gates import FrameOrder, Workspace
-from fastrod_device.tracker import MarkerTracker
+from fastrod_device.vision.drawing import DrawnScene, Eye, draw, project
+from fastrod_device.vision.gates import FrameOrder, Workspace
+from fastrod_device.vision.tracker import MarkerTracker
 
 CAMERA = Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
 BENT = replace(CAMERA, distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0))

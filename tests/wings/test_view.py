@@ -22,9 +22,9 @@ from fastrod.errors import InputError, UnknownNameError
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robotfile import load_robot
 from fastrod_viewer.app import DEMO_LOG, App, found, view
-from fastrod_viewer.playback import Playback
+from fastrod_viewer.replay.playback import Playback
 from fastrod_viewer.server import serve
-from fastrod_viewer.worlds import FreeWorld, SceneWorld
+from fastrod_viewer.worlds.simulated import FreeWorld, SceneWorld
 
 
 @pytest.mark.parametrize(

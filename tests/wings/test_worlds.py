@@ -12,10 +12,17 @@ from fastrod import Lump, load_robot, robot_names, save_robot
 from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
-from fastrod_viewer.catalogue import HOSTED_SCENES, MUJOCO_SCENES, ROD_SCENES, about, catalogue, open_world
-from fastrod_viewer.hosted import HostedView
-from fastrod_viewer.world import ManualCommand
-from fastrod_viewer.worlds import FreeWorld, SceneWorld, sway
+from fastrod_viewer.worlds.catalogue import (
+    HOSTED_SCENES,
+    MUJOCO_SCENES,
+    ROD_SCENES,
+    about,
+    catalogue,
+    open_world,
+)
+from fastrod_viewer.worlds.hosted import HostedView
+from fastrod_viewer.worlds.simulated import FreeWorld, SceneWorld, sway
+from fastrod_viewer.worlds.world import ManualCommand
 
 HOSTED = ["dual_arm", "explore", "neck_look", "neck_push", "pick_suction", "track_circle"]
 

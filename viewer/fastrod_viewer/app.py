@@ -17,17 +17,17 @@ from fastrod.logs.link import RobotLink
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod_scenes.scene import names
-from fastrod_viewer.canvas import Canvas
-from fastrod_viewer.catalogue import labels, open_world
-from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.drive.page import DrivePage
 from fastrod_viewer.holder import Holder, HolderPanels
 from fastrod_viewer.page import ViewerPage, is_upright, notify, plain
-from fastrod_viewer.playback import Playback, load
-from fastrod_viewer.replay_page import ReplayPage
+from fastrod_viewer.picture.canvas import Canvas
+from fastrod_viewer.replay.page import ReplayPage
+from fastrod_viewer.replay.playback import Playback, load
 from fastrod_viewer.server import serve
 from fastrod_viewer.watch import SceneWatch
-from fastrod_viewer.world import World
-from fastrod_viewer.worlds import FreeWorld
+from fastrod_viewer.worlds.catalogue import labels, open_world
+from fastrod_viewer.worlds.simulated import FreeWorld
+from fastrod_viewer.worlds.world import World
 
 FIRST = "five_segment_reacher"
 """Shown unless something is named."""

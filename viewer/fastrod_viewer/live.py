@@ -10,10 +10,10 @@ from fastrod.errors import FastrodError, InputError
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 from fastrod_viewer.app import App
-from fastrod_viewer.robots import radii
-from fastrod_viewer.scene_graph import grid_places
-from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
-from fastrod_viewer.worlds import bodies_of
+from fastrod_viewer.picture.scene_graph import grid_places
+from fastrod_viewer.worlds.robots import radii
+from fastrod_viewer.worlds.simulated import bodies_of
+from fastrod_viewer.worlds.world import Body, DrawnRods, ManualCommand, World
 
 _SPACING = 1.5  # robot lengths between robots that touch nothing
 

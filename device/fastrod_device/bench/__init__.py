@@ -1,0 +1,1 @@
+"""Experiments on a prototype: calibration, excitation, the whole loop."""

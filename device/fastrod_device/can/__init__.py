@@ -1,0 +1,1 @@
+"""Drives on CAN: the bus, their objects, their configuration and faults."""

@@ -1,0 +1,1 @@
+"""An emulated prototype: drives, motors, the plant behind them."""

@@ -1,0 +1,1 @@
+"""The camera: its calibration, its marker, its pictures."""

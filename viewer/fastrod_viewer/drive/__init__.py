@@ -1,0 +1,1 @@
+"""A robot that is driven from a page: controls, session, limits."""

@@ -1,0 +1,1 @@
+"""A measured log beside the predictions of models."""

@@ -1,0 +1,1 @@
+"""Worlds that a page shows: free robots, scenes, hosts."""
