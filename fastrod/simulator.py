@@ -8,21 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import Bound, check_number
 from fastrod.effects.executor import SensedPoses, from_base
 from fastrod.errors import InputError
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
 from fastrod.solver import options
 from fastrod.solver.gpu import device as devices
-from fastrod.solver.inputs import (
-    Inputs,
-    PointForces,
-    arclengths,
-    check_positive,
-    mobility,
-    named_inputs,
-    robot_mask,
-)
+from fastrod.solver.inputs import Inputs, PointForces, arclengths, mobility, named_inputs, robot_mask
 from fastrod.solver.observer import ObserverSolver
 from fastrod.solver.options import Modal, Observer, SchemeName, SolverName
 from fastrod.solver.protocol import How, Solver
@@ -251,7 +244,7 @@ class Simulator(RobotBatch):
         `rows` are indices of robots, or a mask: the others stay as they are, in the state as well; their
         inputs are not read. Not with a contact scene.
         """
-        check_positive("tolerance", tolerance, "m")
+        check_number("tolerance", tolerance, Bound(above=0.0, unit="m"))
         if tendon_length is None and tension is None:
             tendon_length, tension = self._at_rest()
         given = Inputs(
@@ -468,7 +461,7 @@ class Simulator(RobotBatch):
         [m]; after the first state, its clearance. nan but for `rows`, indices or a mask, where they are
         given. Raises `InputError` as `clearance`."""
         engine = self._contact("swept_clearance")
-        check_positive("tolerance", tolerance, "m")
+        check_number("tolerance", tolerance, Bound(above=0.0, unit="m"))
         from fastrod.contact import queries
 
         now = self._full("swept_clearance").as_shape()

@@ -195,10 +195,6 @@ SIMULATORS: Rows = [
     (lambda: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**30), "would take"),
     (lambda: Observer(kept_jacobian_tolerance=-1e-9), "Observer.kept_jacobian_tolerance"),
-    (lambda: Observer(kept_jacobian_tolerance=np.inf), "Observer.kept_jacobian_tolerance"),
-    (lambda: Observer(kept_jacobian_tolerance=np.nan), "Observer.kept_jacobian_tolerance"),
-    (lambda: Observer(kept_jacobian_tolerance="much"), "Observer.kept_jacobian_tolerance"),
-    (lambda: Observer(kept_jacobian_tolerance=None), "Observer.kept_jacobian_tolerance"),
     (lambda: Simulator(rod()).jacobian(), "call step or settle first"),
     (lambda: Simulator(rod()).compliance(), "call step or settle first"),
     (lambda: Simulator(rod()).shape(0.01), "call step or settle first"),
@@ -271,11 +267,7 @@ MOTION: Rows = [
         "^solver is 'observer' with a robot with lumps",
     ),
     (lambda: moving(scheme="bdf3"), "^scheme is 'bdf3'; did you mean 'bdf2'"),
-    (lambda: moving(scheme=["bdf1"]), r"^scheme is \['bdf1'\]; did you mean 'bdf1'"),
-    *(
-        (lambda rho=rho: Modal(dynamics=True, rho=rho), f"^rho is {rho!r}; give a number from 0 .* to 0.9")
-        for rho in (1, -0.1, np.nan, "half")
-    ),
+    (lambda: Modal(dynamics=True, rho=1), "^rho is 1; it must be a number from 0 to 0.9. Beyond it"),
     (lambda: moving(dt=0.0), "^dt is 0.0 s; it must be a number, positive and finite"),
     (lambda: moving(dynamics=False, scheme="bdf2"), "^scheme is 'bdf2' without dynamics, and nothing moves"),
     (lambda: Modal(rho=0.8), "^rho is 0.8 without dynamics"),

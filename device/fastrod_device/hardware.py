@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fastrod.errors import InputError, UnknownNameError, nearest, shown
+from fastrod.checks import Bound, check_number
+from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.loading import load_robot
 from fastrod.model.robot import Robot
 from fastrod.tomlfile import parse, read_text
@@ -61,9 +62,7 @@ class Hardware:
             ("pretension", 0.01, self.limits.tension, "N"),
             ("homing_speed", 1e-4, 0.1, "m/s"),
         ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise InputError(f"{name} is {shown(value)}; it must be from {low:g} to {high:g} {unit}.")
+            check_number(name, getattr(self, name), Bound(least=low, most=high, unit=unit))
         steps = np.abs(Transmission(self.drives).tension(np.ones(len(nodes), dtype=np.int64)))
         if self.pretension < (1.0 - 1e-9) * steps.max():
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3

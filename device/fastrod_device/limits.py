@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from fastrod.errors import InputError, shown
+from fastrod.checks import Bound, check
+from fastrod.errors import InputError
 from fastrod.types import Floats
 
-# beyond this it was given in the other unit
-_LARGEST = {"m": (0.5, "mm"), "m/s": (1.0, "mm/s"), "s": (60.0, "ms")}
-_LEAST, _MOST = 1e-9, 1e9  # of any limit in its unit
-
-
-def _unit(name: str) -> str:
-    units = {"rate": "m/s", "curvature": "1/m", "tension": "N", "slack": "N"}
-    return units.get(name, "m" if name in ("displacement", "following_error", "encoder_jump") else "s")
+Length = Annotated[float, Bound(least=1e-9, most=0.5, unit="m", hint="Was it given in mm?")]
+Speed = Annotated[float, Bound(least=1e-9, most=1.0, unit="m/s", hint="Was it given in mm/s?")]
+Age = Annotated[float, Bound(least=1e-9, most=60.0, unit="s", hint="Was it given in ms?")]
+Force = Annotated[float, Bound(least=1e-9, most=1e9, unit="N")]
+Curvature = Annotated[float, Bound(least=1e-9, most=1e9, unit="1/m")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,52 +28,36 @@ class Limits:
     0.006
     """
 
-    displacement: float = 0.008
+    displacement: Length = 0.008
     """Largest change of a tendon's length, either way [m]."""
-    rate: float = 0.03
+    rate: Speed = 0.03
     """Largest rate of a tendon [m/s]: the set-points keep to it."""
-    curvature: float = 20.0
+    curvature: Curvature = 20.0
     """Largest of any segment [1/m], by the constant curvature that the tendons ask for."""
-    tension: float = 15.0
+    tension: Force = 15.0
     """Largest of any tendon, from the motor's torque, either way [N]."""
-    slack: float | None = None
+    slack: Force | None = None
     """Least tension of any tendon while the drives are enabled [N]; None: a tendon may hang."""
-    command_age: float = 0.5
+    command_age: Age = 0.5
     """A command that was meant longer ago is refused, and one must be renewed this often while the robot
     moves [s]."""
-    feedback_age: float = 0.03
+    feedback_age: Age = 0.03
     """Largest age of a drive's process data [s]."""
-    heartbeat_age: float = 0.15
+    heartbeat_age: Age = 0.15
     """Largest age of a drive's heartbeat [s]."""
-    sighting_age: float | None = 0.5
+    sighting_age: Age | None = 0.5
     """Largest age of the newest good sighting of the marker [s]; None: the camera stops nothing."""
-    cycle: float = 0.05
+    cycle: Age = 0.05
     """Longest gap between two control cycles [s]."""
-    following_error: float = 0.001
+    following_error: Length = 0.001
     """Largest difference of where a drive was commanded to be and where it is, as tendon [m]."""
-    encoder_jump: float = 0.0005
+    encoder_jump: Length = 0.0005
     """Largest change of a tendon's length between two samples beyond what `rate` explains [m]."""
-    clock_jump: float = 0.2
+    clock_jump: Age = 0.2
     """Largest disagreement of the wall clock with the monotonic one over a control cycle [s]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value, unit = getattr(self, name), _unit(name)
-            if value is None and name in ("slack", "sighting_age"):
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
-                raise InputError(f"Limits.{name} is {shown(value)}; it must be a positive number [{unit}].")
-            largest, other = _LARGEST.get(unit, (_MOST, ""))
-            if value > largest:
-                hint = f" Was it given in {other}?" if other else ""
-                raise InputError(
-                    f"Limits.{name} is {shown(value)} {unit}; more than {largest:g} {unit}.{hint}"
-                )
-            if value < _LEAST:
-                raise InputError(
-                    f"Limits.{name} is {shown(value)} {unit}; less than {_LEAST:g} {unit}, "
-                    "which nothing can keep."
-                )
+        check(self)
         if self.slack is not None and self.slack >= self.tension:
             raise InputError(
                 f"Limits.slack is {self.slack!r} N and tension {self.tension!r} N; the least "

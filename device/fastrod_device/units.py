@@ -5,23 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Annotated, Literal, final
 
 import numpy as np
 
-from fastrod.errors import InputError, shown
+from fastrod.checks import Bound, check
+from fastrod.errors import InputError
 from fastrod.types import Floats, Ints
 from fastrod_device.readings import DriveFeedback, Readings
-
-_RANGE = {
-    "drum_radius": (1e-4, 0.1),
-    "gear": (1e-3, 1e6),
-    "counts_per_turn": (1, 1e9),
-    "torque_constant": (1e-6, 1e3),
-    "rated_torque": (1e-6, 1e4),
-    "efficiency": (1e-3, 1.0),
-}
-"""Ranges of a `DriveSpec`'s numbers: wide of every drive, and their products still are counts and newtons."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,44 +23,25 @@ class DriveSpec:
     584
     """
 
-    node: int
+    node: Annotated[int, Bound(least=1, most=126)]
     """CANopen node id, 1 to 126."""
-    drum_radius: float
+    drum_radius: Annotated[float, Bound(least=1e-4, most=0.1, unit="m", hint="Was it given in mm?")]
     """To the middle of the wound tendon [m]."""
-    direction: int = 1
+    direction: Literal[1, -1] = 1
     """+1 where growing counts pull the tendon in, -1 where they let it out."""
-    gear: float = 21.0
+    gear: Annotated[float, Bound(least=1e-3, most=1e6)] = 21.0
     """Turns of the motor in one turn of the drum."""
-    counts_per_turn: int = 4096
+    counts_per_turn: Annotated[int, Bound(least=1, most=1e9)] = 4096
     """Counts per turn of the motor's encoder, edges of both channels counted."""
-    torque_constant: float = 0.0251
+    torque_constant: Annotated[float, Bound(least=1e-6, most=1e3, unit="N m/A")] = 0.0251
     """Torque constant of the motor [N m/A]."""
-    rated_torque: float = 0.054
+    rated_torque: Annotated[float, Bound(least=1e-6, most=1e4, unit="N m")] = 0.054
     """Rated torque of the motor [N m]; CiA 402 counts torque in thousandths of it."""
-    efficiency: float = 0.8
+    efficiency: Annotated[float, Bound(least=1e-3, most=1.0)] = 0.8
     """Efficiency of the gear, 0 to 1: what of the motor's torque reaches the drum."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.node, bool) or not isinstance(self.node, int) or not 1 <= self.node <= 126:
-            raise InputError(
-                f"DriveSpec.node is {self.node!r}; a CANopen node id is a whole number from 1 to 126."
-            )
-        if self.direction not in (1, -1):
-            raise InputError(
-                f"DriveSpec.direction is {self.direction!r}; it must be 1 (growing counts pull) or -1."
-            )
-        for name, (low, high) in _RANGE.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not (isinstance(value, (int, float)) and value > 0.0):
-                raise InputError(
-                    f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be a positive number."
-                )
-            if not low <= value <= high:
-                hint = " Was it given in mm?" if name == "drum_radius" and value > high else ""
-                raise InputError(
-                    f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be from "
-                    f"{low:g} to {high:g}.{hint}"
-                )
+        check(self)
 
     @property
     def metres_per_count(self) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import mmap
 import os
 import re
@@ -13,10 +12,11 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from fastrod.checks import POSITIVE, Bound, check
 from fastrod.contact import trimesh_reader
 from fastrod.errors import InputError, nearest, shown
 from fastrod.types import Floats, Ints
@@ -37,24 +37,17 @@ class MeshLimits:
     256000000
     """
 
-    n_bytes: int = 256_000_000
+    n_bytes: Annotated[int, Bound(least=1)] = 256_000_000
     """Largest size of the file [bytes]."""
-    n_faces: int = 1_000_000
+    n_faces: Annotated[int, Bound(least=1)] = 1_000_000
     """Triangles of all its bodies, with each instance counted."""
-    seconds: float = 10.0
+    seconds: Annotated[float, POSITIVE] = 10.0
     """Until a file of more than 4 MB, or of more than 100 bodies, must be read; smaller ones take less."""
-    memory: int = 2_000_000_000
+    memory: Annotated[int, Bound(least=1)] = 2_000_000_000
     """Memory of the process that reads such a file [bytes]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not (math.isfinite(value) and value > 0)
-            ):
-                raise InputError(f"MeshLimits.{name} is {value!r}; it must be a positive number.")
+        check(self)
 
 
 class _Declared(NamedTuple):

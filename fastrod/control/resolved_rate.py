@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import cast, final
+from typing import Annotated, cast, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import Bound, check
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 
@@ -34,11 +35,11 @@ class ResolvedRate:
     [0.2, 0.0]
     """
 
-    gain: float = 1.0
+    gain: Annotated[float, Bound(least=0.0, unit="1/s")] = 1.0
     """Gain of the error [1/s]."""
-    damping: float = 1e-2
+    damping: Annotated[float, Bound(least=0.0)] = 1e-2
     """Largest damping l, at a singular Jacobian; the unit of the weighted Jacobian. 0: none."""
-    threshold: float | None = None
+    threshold: Annotated[float | None, Bound(above=0.0, infinite=True)] = None
     """Singular value below which damping sets in; by default `damping`. Infinite: the same damping
     everywhere."""
     lower: ArrayLike | None = None
@@ -50,11 +51,11 @@ class ResolvedRate:
     weight: ArrayLike | None = None
     """(n_q,) cost of each coordinate's rate squared, positive; None: 1 each. A coordinate of ten times the
     unit wants a hundredth."""
-    error_limit: float | None = None
+    error_limit: Annotated[float | None, Bound(above=0.0, unit="m", infinite=True)] = None
     """[m] a longer error is shortened to this before the gain; None: no limit."""
     posture: ArrayLike | None = None
     """(n_q,) where q goes as far as the task leaves it free; None: nowhere."""
-    posture_gain: float = 1.0
+    posture_gain: Annotated[float, Bound(least=0.0, unit="1/s")] = 1.0
     """Gain of `posture - q` [1/s]."""
     nearest: bool = False
     """Nearest rates: of all within the limits, those of least |J q_dot - task|^2 + damping^2 sum of weight
@@ -66,18 +67,7 @@ class ResolvedRate:
     """(n_q,) weight^(-1/2)."""
 
     def __post_init__(self) -> None:
-        for name, unit in (("gain", "1/s"), ("posture_gain", "1/s"), ("damping", "m")):
-            value = getattr(self, name)
-            if not _is_number(value) or value < 0.0:
-                raise InputError(
-                    f"ResolvedRate.{name} is {value!r} {unit}; it must be a finite number, zero or positive."
-                )
-        for name in ("threshold", "error_limit"):
-            value = getattr(self, name)
-            if value is not None and not ((_is_number(value) or value == math.inf) and value > 0.0):
-                raise InputError(
-                    f"ResolvedRate.{name} is {value!r} m; it must be a positive number, or None."
-                )
+        check(self)
         if self.nearest and self.posture is not None:
             raise InputError("ResolvedRate has a posture, for which nearest leaves no room; give one.")
         sizes: dict[str, int] = {}

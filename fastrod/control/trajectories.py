@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.types import Floats
 
@@ -35,7 +36,7 @@ class Trajectory:
     """Position about the center, and velocity."""
 
     def __post_init__(self) -> None:
-        _check_positive(self.name, "period", self.period, "s")
+        check_number(f"period of {self.name}", self.period, Bound(above=0.0, unit="s"))
         try:
             center = np.asarray(self.center, dtype=np.float64)
         except (TypeError, ValueError):
@@ -60,7 +61,7 @@ def square(*, side: float = 0.4, period: float = 20.0, center: ArrayLike = (0.0,
     """A square of this side [m] about the center, counterclockwise from the corner at (-x, -y), at constant
     speed: a quarter of the period [s] a side. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
     `InputError`."""
-    _check_positive("square", "side", side, "m")
+    check_number("side of square", side, Bound(above=0.0, unit="m"))
     return Trajectory(
         name="square", period=period, center=_center(center), path=lambda t: _square(t, side, period)
     )
@@ -71,7 +72,7 @@ def triangle(*, side: float = 0.04, period: float = 20.0, center: ArrayLike = (0
     the left, at constant speed:
     a third of the period [s] a side. Source: SoftManiSim, CoRL 2024, its experiment with the prototype.
     Raises `InputError`."""
-    _check_positive("triangle", "side", side, "m")
+    check_number("side of triangle", side, Bound(above=0.0, unit="m"))
     return Trajectory(
         name="triangle", period=period, center=_center(center), path=lambda t: _triangle(t, side, period)
     )
@@ -80,7 +81,7 @@ def triangle(*, side: float = 0.04, period: float = 20.0, center: ArrayLike = (0
 def circle(*, radius: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
     """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one lap a period [s].
     Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
-    _check_positive("circle", "radius", radius, "m")
+    check_number("radius of circle", radius, Bound(above=0.0, unit="m"))
     return Trajectory(
         name="circle", period=period, center=_center(center), path=lambda t: _circle(t, radius, period)
     )
@@ -92,7 +93,7 @@ def figure_eight(
     """x = size sin(2 w t), y = size sin(w t) [m] with w = 2 pi / period; by default the paper's x = 0.2 sin(2
     pi t / 10), y = 0.2 sin(pi t / 10), which is back after 20 s. Source: SoftManiSim, CoRL 2024, its tracking
     experiment. Raises `InputError`."""
-    _check_positive("figure_eight", "size", size, "m")
+    check_number("size of figure_eight", size, Bound(above=0.0, unit="m"))
 
     def path(t: Floats) -> tuple[Floats, Floats]:
         w = 2.0 * math.pi / period
@@ -116,7 +117,7 @@ def helix(
     """The circle that sinks (or, `downward` False, rises) by `pitch` [m] a lap, from the height of the
     center; a lap takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
     `InputError`."""
-    _check_positive("helix", "radius", radius, "m")
+    check_number("radius of helix", radius, Bound(above=0.0, unit="m"))
     rise = _rise("helix", pitch, downward, period)
     return Trajectory(
         name="helix",
@@ -137,7 +138,7 @@ def square_helix(
     """The square that sinks (or, `downward` False, rises) evenly by `pitch` [m] a lap, from the height of the
     center; a lap takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
     `InputError`."""
-    _check_positive("square_helix", "side", side, "m")
+    check_number("side of square_helix", side, Bound(above=0.0, unit="m"))
     rise = _rise("square_helix", pitch, downward, period)
     return Trajectory(
         name="square_helix",
@@ -239,8 +240,8 @@ def _lifted(flat: tuple[Floats, Floats], t: Floats, rise: float) -> tuple[Floats
 
 def _rise(name: str, pitch: float, downward: bool, period: float) -> float:
     """[m/s]."""
-    _check_positive(name, "pitch", pitch, "m")
-    _check_positive(name, "period", period, "s")
+    check_number(f"pitch of {name}", pitch, Bound(above=0.0, unit="m"))
+    check_number(f"period of {name}", period, Bound(above=0.0, unit="s"))
     return (-pitch if downward else pitch) / period
 
 
@@ -257,10 +258,3 @@ def _times(t: ArrayLike) -> Floats:
     if not np.isfinite(times).all():
         raise InputError("t holds a time that is not finite; give times [s].")
     return times
-
-
-def _check_positive(name: str, what: str, value: float, unit: str) -> None:
-    if not isinstance(value, (int, float, np.floating, np.integer)) or not (
-        math.isfinite(value) and value > 0.0
-    ):
-        raise InputError(f"{what} of {name} is {value!r} {unit}; it must be a number, positive and finite.")

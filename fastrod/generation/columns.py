@@ -9,8 +9,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import InputError
-
 
 @dataclass(frozen=True, eq=False)
 class Column:
@@ -58,27 +56,3 @@ def several(names: Sequence[str], values: NDArray[Any], unit: str, about: str) -
 def numbered(prefix: str, values: NDArray[Any], unit: str, about: str) -> list[Column]:
     """Return columns of `values` (n_rows, m) named prefix_1 to prefix_m."""
     return several([f"{prefix}_{k}" for k in range(1, values.shape[1] + 1)], values, unit, about)
-
-
-def within(
-    name: str,
-    value: object,
-    low: float,
-    high: float,
-    unit: str = "",
-    *,
-    whole: bool = False,
-    open_low: bool = False,
-) -> None:
-    """Raises `InputError` where `value` is no number from `low` to `high`; `open_low`: `low` itself is
-    out."""
-    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
-    good = isinstance(value, kinds) and not isinstance(value, bool)
-    number: Any = value
-    enough = good and (low < number if open_low else low <= number)
-    if not (enough and number <= high and number != np.inf):
-        what = "a whole number" if whole else "a number"
-        ends = f"{'above' if open_low else 'at least'} {low:g}" + (
-            " and finite" if high == np.inf else f" and at most {high:g}"
-        )
-        raise InputError(f"{name} is {value!r}{' ' + unit if unit else ''}; it must be {what} {ends}.")

@@ -12,8 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias, final
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import FastrodError, InputError, shown
-from fastrod.generation.columns import within
 from fastrod.generation.rollouts import Rollouts
 from fastrod.generation.shapes import Shapes
 from fastrod.generation.sweep import Sweep
@@ -50,11 +50,11 @@ class Plan:
             raise InputError(
                 f"work is {shown(self.work)}; give {', '.join(kind.__name__ for kind in KINDS.values())}."
             )
-        within("count", self.count, 1, 10**12, whole=True)
-        within("seed", self.seed, 0, 2**63, whole=True)
+        check_number("count", self.count, Bound(least=1, most=10**12), whole=True)
+        check_number("seed", self.seed, Bound(least=0, most=2**63), whole=True)
         if self.shard_rows == 0:
             object.__setattr__(self, "shard_rows", self.work.usual)
-        within("shard_rows", self.shard_rows, 1, 10**7, whole=True)
+        check_number("shard_rows", self.shard_rows, Bound(least=1, most=10**7), whole=True)
         if not self.version:
             object.__setattr__(self, "version", version("fastrod"))
 

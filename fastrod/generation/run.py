@@ -13,8 +13,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, final
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, shown
-from fastrod.generation.columns import within
 from fastrod.generation.here import cores, run_here
 from fastrod.generation.on_ray import run_on_ray
 from fastrod.generation.plan import PLAN, SHARDS, Plan, settle_plan
@@ -81,7 +81,7 @@ def generate(
             "'local' to start one."
         )
     if workers is not None:
-        within("workers", workers, 1, 4096, whole=True)
+        check_number("workers", workers, Bound(least=1, most=4096), whole=True)
     for module, extra in (("pyarrow", "parquet"), *((("ray", "ray"),) if ray is not None else ())):
         if find_spec(module) is None:
             raise InputError(f"fastrod generate needs {module}: pip install 'fastrod[{extra}]'.")

@@ -9,8 +9,9 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError
-from fastrod.generation.columns import Column, numbered, several, within
+from fastrod.generation.columns import Column, numbered, several
 from fastrod.generation.draws import robot_of
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
@@ -139,10 +140,10 @@ class Shapes:
     """Rows of a chain; 1 draws every row on its own, and settles it cold."""
 
     def __post_init__(self) -> None:
-        within("bend", self.bend, 0.0, 3.0, "rad", open_low=True)
-        within("tolerance", self.tolerance, 1e-12, 1e-2, "m")
-        within("points_per_segment", self.points_per_segment, 2, 200, whole=True)
-        within("chain", self.chain, 1, LONGEST_CHAIN, whole=True)
+        check_number("bend", self.bend, Bound(above=0.0, most=3.0, unit="rad"))
+        check_number("tolerance", self.tolerance, Bound(least=1e-12, most=1e-2, unit="m"))
+        check_number("points_per_segment", self.points_per_segment, Bound(least=2, most=200), whole=True)
+        check_number("chain", self.chain, Bound(least=1, most=LONGEST_CHAIN), whole=True)
         robot = robot_of(self.robot)
         if robot.effects:
             raise InputError(
@@ -153,9 +154,9 @@ class Shapes:
         if isinstance(self.force, (int, float)) and self.force < 0.0:
             softest = min(min(segment.bending_stiffness) for segment in robot.segments)
             object.__setattr__(self, "force", float(f"{_LOAD * softest / robot.length**2:.3g}"))
-        within("force", self.force, 0.0, math.inf, "N")
+        check_number("force", self.force, Bound(least=0.0, unit="N"))
         nodes = robot.n_segments * self.points_per_segment
-        within("points", self.points, 0, nodes, whole=True)
+        check_number("points", self.points, Bound(least=0, most=nodes), whole=True)
         if self.points and nodes % self.points:
             near = min((k for k in range(1, nodes + 1) if nodes % k == 0), key=lambda k: abs(k - self.points))
             raise InputError(

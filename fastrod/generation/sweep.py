@@ -10,8 +10,9 @@ from typing import Any, final
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import FastrodError, InputError
-from fastrod.generation.columns import Column, within
+from fastrod.generation.columns import Column
 from fastrod.generation.draws import named, robot_of, with_effects
 from fastrod.model.robot import Robot
 
@@ -38,9 +39,9 @@ class Sweep:
     """Largest bend of a segment [rad]."""
 
     def __post_init__(self) -> None:
-        within("noise", self.noise, 0.0, 1.0, "m")
-        within("rate", self.rate, 0.1, 1e4, "Hz")
-        within("bend", self.bend, 0.0, 3.0, "rad", open_low=True)
+        check_number("noise", self.noise, Bound(least=0.0, most=1.0, unit="m"))
+        check_number("rate", self.rate, Bound(least=0.1, most=1e4, unit="Hz"))
+        check_number("bend", self.bend, Bound(above=0.0, most=3.0, unit="rad"))
         if not self.effects:
             raise InputError("a sweep has no effects; name one, such as backlash.")
         object.__setattr__(self, "effects", named(self.effects))

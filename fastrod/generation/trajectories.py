@@ -9,8 +9,9 @@ from typing import final
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, shown
-from fastrod.generation.columns import Column, numbered, several, within
+from fastrod.generation.columns import Column, numbered, several
 from fastrod.generation.draws import in_ball, named, robot_of, with_effects
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
@@ -52,11 +53,11 @@ class Trajectories:
     """The rod has inertia; every segment of the robot needs a line_density, or this raises `InputError`."""
 
     def __post_init__(self) -> None:
-        within("steps", self.steps, 1, 10**6, whole=True)
-        within("dt", self.dt, 0.0, 10.0, "s", open_low=True)
-        within("bend", self.bend, 0.0, 3.0, "rad", open_low=True)
-        within("speed", self.speed, 0.0, 1e3, "rad/s", open_low=True)
-        within("force", self.force, 0.0, math.inf, "N")
+        check_number("steps", self.steps, Bound(least=1, most=10**6), whole=True)
+        check_number("dt", self.dt, Bound(above=0.0, most=10.0, unit="s"))
+        check_number("bend", self.bend, Bound(above=0.0, most=3.0, unit="rad"))
+        check_number("speed", self.speed, Bound(above=0.0, most=1e3, unit="rad/s"))
+        check_number("force", self.force, Bound(least=0.0, unit="N"))
         object.__setattr__(self, "effects", named(self.effects))
         SegmentActions(robot_of(self.robot))
         if not isinstance(self.dynamics, bool):

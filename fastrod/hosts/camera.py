@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fastrod.checks import Bound, check
 from fastrod.errors import InputError
 from fastrod.hosts.bullet import Bullet
 from fastrod.types import Floats
@@ -46,11 +47,11 @@ class HostCamera:
     60.0
     """
 
-    width: int = 640
+    width: Annotated[int, Bound(least=1)] = 640
     """Pixels of a row."""
-    height: int = 480
+    height: Annotated[int, Bound(least=1)] = 480
     """Pixels of a column."""
-    fov: float = 60.0
+    fov: Annotated[float, Bound(above=0.0, below=180.0, unit="deg")] = 60.0
     """Vertical angle of view [deg]."""
     near: float = 0.01
     """Nearest distance along the optical axis that is drawn [m]."""
@@ -58,14 +59,7 @@ class HostCamera:
     """Farthest distance along the optical axis that is drawn [m]."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise InputError(
-                    f"Camera.{name} is {value!r}; it must be a whole number of pixels, at least 1."
-                )
-        if not 0.0 < self.fov < 180.0:
-            raise InputError(f"Camera.fov is {self.fov!r}; it must be between 0 and 180 degrees.")
+        check(self, "Camera.")
         if not 0.0 < self.near < self.far < math.inf:
             raise InputError(
                 f"Camera.near is {self.near!r} m and Camera.far is {self.far!r} m; it must be 0 < near < far."

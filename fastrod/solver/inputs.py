@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from sys import float_info
 from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
@@ -47,12 +46,6 @@ def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
         return function(*args, **inputs)
 
     return checked
-
-
-def check_positive(name: str, value: object, unit: str) -> None:
-    """Raise `InputError` unless this is a positive number."""
-    if not isinstance(value, (int, float, np.floating, np.integer)) or not 0.0 < value <= float_info.max:
-        raise InputError(f"{name} is {shown(value)} {unit}; it must be a number, positive and finite.")
 
 
 def robot_mask(rows: ArrayLike, n_robots: int) -> Flags:

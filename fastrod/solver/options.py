@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from sys import float_info
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numba
 import numpy as np
 
+from fastrod.checks import NOT_NEGATIVE, POSITIVE, Bound, check, check_number
 from fastrod.errors import InputError, RobotError, nearest, shown
 from fastrod.model.robot import Robot
-from fastrod.solver.inputs import check_positive
 
 SchemeName: TypeAlias = Literal["bdf1", "bdf2", "generalized_alpha"]
 SolverName: TypeAlias = Literal["observer", "modal"]
@@ -43,29 +42,17 @@ class Observer:
     boundary over time.
     """
 
-    process_noise: float | None = None
+    process_noise: Annotated[float | None, POSITIVE] = None
     """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
-    measurement_noise: float = 1e-20
+    measurement_noise: Annotated[float, POSITIVE] = 1e-20
     """V^-1, variance of a boundary residual times time [m^2 s]; with a process noise."""
-    kept_jacobian_tolerance: float = 0.0
+    kept_jacobian_tolerance: Annotated[float, NOT_NEGATIVE] = 0.0
     """Residual [m] below which a step corrects the boundary by the Jacobian that it has (chord Newton),
     without new sensitivities: a third of the time, and the observer lags by about so much. A robot that feels
     contact takes new ones."""
 
     def __post_init__(self) -> None:
-        for name, value in (
-            ("process_noise", self.process_noise),
-            ("measurement_noise", self.measurement_noise),
-        ):
-            if name == "process_noise" and value is None:
-                continue
-            if not isinstance(value, (int, float, np.floating)) or not 0.0 < value <= float_info.max:
-                raise InputError(f"Observer.{name} is {shown(value)}; it must be positive and finite.")
-        kept = self.kept_jacobian_tolerance
-        if not isinstance(kept, (int, float, np.floating)) or not 0.0 <= kept <= float_info.max:
-            raise InputError(
-                f"Observer.kept_jacobian_tolerance is {shown(kept)} m; it must be a number, zero or positive."
-            )
+        check(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,22 +64,13 @@ class Modal:
     """Whether a step moves the rods on by `dt`; else it brings them to rest."""
     scheme: SchemeName = "generalized_alpha"
     """Scheme of a step in time: "generalized_alpha" (second order), "bdf2" or "bdf1"."""
-    rho: float = 0.5
+    rho: Annotated[float, Bound(least=0.0, most=0.9, hint="Beyond it sudden loads grow.")] = 0.5
     """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
     modes: Modes | None = None
     """Resolution of the rod; None: `Modes(6, 4)` at rest, `Modes(4, 2)` in motion."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.dynamics, bool):
-            raise InputError(f"dynamics is {shown(self.dynamics)}; it must be True or False.")
-        names = get_args(SchemeName)
-        if self.scheme not in names:
-            raise InputError(f"scheme is {shown(self.scheme)}; {nearest(str(self.scheme), names)}")
-        if not isinstance(self.rho, (int, float, np.floating, np.integer)) or not 0.0 <= self.rho <= 0.9:
-            raise InputError(
-                f"rho is {shown(self.rho)}; give a number from 0 (strongest damping of high frequencies) to "
-                "0.9: beyond, sudden loads grow."
-            )
+        check(self, "")
         if not self.dynamics and (self.scheme, self.rho) != (Modal.scheme, Modal.rho):
             what = f"scheme is {self.scheme!r}" if self.scheme != Modal.scheme else f"rho is {self.rho!r}"
             raise InputError(f"{what} without dynamics, and nothing moves in time; give dynamics=True.")
@@ -133,7 +111,7 @@ def check_options(points_per_segment: object, dt: object, outputs: object) -> No
         raise InputError(
             f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2."
         )
-    check_positive("dt", dt, "s")
+    check_number("dt", dt, Bound(above=0.0, unit="s"))
     if outputs not in ("full", "tip"):
         raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
 

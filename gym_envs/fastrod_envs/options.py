@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
+from fastrod.checks import Bound, check, check_number
 from fastrod.errors import InputError, nearest
 from fastrod.model.robot import Robot
 from fastrod.solver.gpu.device import Device, checked_name
@@ -23,7 +23,7 @@ Made = TypeVar("Made", bound="EnvOptions")
 class EnvOptions:
     """Keyword arguments of `gymnasium.make` and `make_vec`, the same for every task; some tasks have more."""
 
-    n_steps: int | None = None
+    n_steps: Annotated[int | None, Bound(least=1)] = None
     """Steps of an episode, None for the task's own number; 1, with `action="displacement"`, is the paper's
     bandit."""
     observation: Observation = "state"
@@ -33,7 +33,7 @@ class EnvOptions:
     randomise: Randomisation | Robot | str | Path | Mapping[str, Any] | None = None
     """Robot parameters and effects that differ from episode to episode (`Randomisation`): a robot file,
     such as an identified.toml, or a mapping of names to ranges."""
-    difficulty: float = 1.0
+    difficulty: Annotated[float, Bound(least=0.0, most=1.0)] = 1.0
     """Difficulty from 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between
     episodes (curriculum)."""
     threads: int | None = None
@@ -43,20 +43,8 @@ class EnvOptions:
     have the CPU alone."""
 
     def __post_init__(self) -> None:
-        if self.n_steps is not None and (
-            not isinstance(self.n_steps, Integral) or isinstance(self.n_steps, bool) or self.n_steps < 1
-        ):
-            raise InputError(
-                f"n_steps is {self.n_steps!r}; it must be a whole number, at least 1, or None "
-                "for the task's own."
-            )
-        for name, kinds in (("observation", get_args(Observation)), ("action", get_args(Action))):
-            if getattr(self, name) not in kinds:
-                raise InputError(
-                    f"{name} is {getattr(self, name)!r}; it must be {' or '.join(map(repr, kinds))}."
-                )
-        checked_difficulty(self.difficulty)
-        checked_name(self.device)
+        checked_name(self.device)  # with the nearest of its names
+        check(self, "")
 
     @classmethod
     def read(cls: type[Made], given: Mapping[str, Any]) -> Made:
@@ -70,8 +58,7 @@ class EnvOptions:
 
 def checked_difficulty(level: float) -> float:
     """A level from 0 to 1, or `InputError`."""
-    if not isinstance(level, Real) or not 0.0 <= level <= 1.0:
-        raise InputError(f"difficulty is {level!r}; it must be a number from 0 to 1.")
+    check_number("difficulty", level, Bound(least=0.0, most=1.0))
     return float(level)
 
 

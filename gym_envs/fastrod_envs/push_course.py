@@ -23,11 +23,6 @@ class PushOptions(EnvOptions):
     """Whether the force of the cube on the bar bends the robot in its next step; False: the bar moves as
     if nothing were there."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not isinstance(self.feels, bool):
-            raise InputError(f"feels is {self.feels!r}; it must be True or False.")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Course:

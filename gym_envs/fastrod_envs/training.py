@@ -11,10 +11,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import msgspec
 
+from fastrod.checks import Bound, check
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod_envs.actor import actor_of
 from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
@@ -42,38 +43,24 @@ class TrainingPlan:
     env: str
     """Id of the environment."""
     algorithm: str
-    n_envs: int
-    steps: int
+    n_envs: Annotated[int, Bound(least=1, most=10**6)]
+    steps: Annotated[int, Bound(least=0, most=10**15)]
     """Environment steps in all."""
-    seed: int
-    imitate: int
+    seed: Annotated[int, Bound(least=0, most=2**32 - 1)]
+    imitate: Annotated[int, Bound(least=0, most=10**15)]
     """Steps of lessons by the scripted baseline before."""
     options: dict[str, Any]
     """Options of the environment."""
     settings: dict[str, Any]
     """Keyword arguments of the algorithm, as stable-baselines3 names them."""
-    curriculum: float
+    curriculum: Annotated[float, Bound(least=0.0, most=1.0)]
     """Difficulty at the start; it rises evenly to 1 over the first half."""
 
     def __post_init__(self) -> None:
         name_of(self.env)
         if self.algorithm not in ALGORITHMS:
             raise UnknownNameError(f"no algorithm {self.algorithm!r}; {nearest(self.algorithm, ALGORITHMS)}")
-        for what, least, most in (
-            ("steps", 0, 10**15),
-            ("n_envs", 1, 10**6),
-            ("seed", 0, 2**32 - 1),
-            ("imitate", 0, 10**15),
-        ):
-            value = getattr(self, what)
-            if not isinstance(value, int) or not least <= value <= most:
-                raise InputError(
-                    f"{what} is {shown(value)}; it must be a whole number from {least} to {most}."
-                )
-        if not 0.0 <= self.curriculum <= 1.0:
-            raise InputError(
-                f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1."
-            )
+        check(self, "")
         check_settings(self.algorithm, self.settings)
 
 

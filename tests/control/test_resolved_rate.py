@@ -197,8 +197,7 @@ REFUSED = {
     ): ask(error=np.zeros(2)),
     "q has 5 coordinates; this ResolvedRate is made for 4.": ask(q=np.zeros(5), jacobian=np.ones((3, 5))),
     "dt is 0.0 s; it must be a number, positive and finite.": ask(dt=0.0),
-    "ResolvedRate.gain is -1.0 1/s; it must be a finite number, zero or positive.": made(gain=-1.0),
-    "ResolvedRate.error_limit is 0.0 m; it must be a positive number, or None.": made(error_limit=0.0),
+    "ResolvedRate.gain is -1.0 1/s; it must be a number, zero or positive and finite.": made(gain=-1.0),
     "ResolvedRate has a posture, for which nearest leaves no room; give one.": made(
         nearest=True, posture=[0.0]
     ),

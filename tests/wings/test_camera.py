@@ -61,8 +61,8 @@ def test_the_picture_is_upright_and_not_mirrored(world):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"width": 0}, "Camera.width is 0; it must be a whole number of pixels"),
-        ({"fov": 180.0}, "Camera.fov is 180.0; it must be between 0 and 180 degrees"),
+        ({"width": 0}, "Camera.width is 0; it must be a whole number, at least 1"),
+        ({"fov": 180.0}, "Camera.fov is 180.0 deg; it must be a number between 0 and 180 deg"),
         ({"near": 1.0, "far": 0.5}, "it must be 0 < near < far"),
     ],
 )

@@ -70,7 +70,7 @@ def typo(wrong, right):
 
 
 STEPS = "tells torque in steps of"
-RATES = "it must be from 50 to 500 Hz."
+RATES = "it must be a number from 50 to 500 Hz."
 NAMES = "give a shipped robot's name, or a robot file's in quotes."
 ARUCO = "no marker dictionary 'DICT_4X4_5'; did you mean 'DICT_4X4_50'?"
 SECOND = "[[drive]]\nnode = 2\ndrum_radius = 0.008\n"
@@ -86,13 +86,13 @@ MISTAKES = {
     "drive without drum": ("drum_radius = 0.008     # m", "", "drive 1 lacks drum_radius."),
     "a word for a number": ("size = 0.018", 'size = "18 mm"', "[marker]: size: Expected 'float', got 'str'."),
     "one of many": ("[640, 480]", '[640, "480"]', "[camera]: size[1]: Expected 'int', got 'str'."),
-    "a word for the rate": ("rate = 100.0 ", 'rate = "fast" ', f"rate is 'fast'; {RATES}"),
+    "a word for the rate": ("rate = 100.0 ", 'rate = "fast" ', f"rate is 'fast' Hz; {RATES}"),
     "weak pretension": ("pretension = 1.0 ", "pretension = 0.1 ", f"pretension is 0.1 N; {WEAK}"),
     "a coarser drive": (DRUM, COARSE, f"node 3 {STEPS} 1.13 N of its tendon, so it must"),
-    "rate out of range": ("rate = 100.0 ", "rate = 5.0 ", f"rate is 5.0; {RATES}"),
-    "drum in mm": ("= 0.008     # m", "= 8", "drive 1: DriveSpec.drum_radius of node 1 is 8"),
+    "rate out of range": ("rate = 100.0 ", "rate = 5.0 ", f"rate is 5.0 Hz; {RATES}"),
+    "drum in mm": ("= 0.008     # m", "= 8", "drive 1: DriveSpec.drum_radius is 8.0 m"),
     "dictionary": ("DICT_4X4_50", "DICT_4X4_5", f"[marker]: {ARUCO}"),
-    "number": ("id = 7", "id = 70", "[marker]: Marker.id is 70; DICT_4X4_50 has the numbers 0 to 49."),
+    "number": ("id = 7", "id = 70", "[marker]: Marker.id is 70; it must be a whole number from 0 to 49."),
     "a node twice": ("node = 4", "node = 3", TWICE),
     "too few drives": (SECOND, "", "there are 3 drives and robot 'prototype' has 4 tendons."),
     "robot is a number": ('"prototype"', "3", f"robot is 3; {NAMES}"),

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import fastrod
-from fastrod.errors import InputError
 from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import read_log
 from fastrod.logs.simulated import SimulatedRobot
@@ -115,12 +114,6 @@ def test_bends_and_controls_end_where_the_tendons_do():
     assert groups["Segment 1"].controls[0].high == np.floor(np.degrees(0.005 / 0.0075))
     assert groups["Tendons"].controls[0].high < 5.0
     assert "Base" not in groups  # nothing moves the base of a robot at the other end
-
-
-@pytest.mark.parametrize("name", ["displacement", "rate"])
-def test_a_limit_is_positive(name):
-    with pytest.raises(InputError, match=f"TendonLimits.{name} is 0.0; it must be positive"):
-        TendonLimits(**{name: 0.0})
 
 
 def test_a_link_that_offers_nothing_is_driven_all_the_same():

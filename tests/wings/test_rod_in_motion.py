@@ -63,5 +63,5 @@ def test_it_goes_back_to_a_snapshot_and_continues_after_a_reset() -> None:
 def test_what_it_cannot_do_is_a_sentence() -> None:
     with pytest.raises(InputError, match="needs a mass"):
         Rod(small("passive"), dynamics=True)
-    with pytest.raises(InputError, match=r"^rho is 1\.0; give a number from 0"):
+    with pytest.raises(InputError, match=r"^rho is 1\.0; it must be a number from 0"):
         Rod(beam(), dynamics=True, rho=1.0)

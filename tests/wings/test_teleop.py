@@ -135,11 +135,6 @@ def test_ranges_are_round_numbers_that_suit_the_robot() -> None:
     assert largest_force(fastrod.load_robot("prototype")) == 1.0
 
 
-def test_speeds_are_positive() -> None:
-    with pytest.raises(InputError, match=r"Speeds.bend is 0.0; it must be positive"):
-        Speeds(bend=0.0)
-
-
 @pytest.mark.real_time
 def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
     world, teleop = piloted("prototype")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, final
 
 import numpy as np
 
+from fastrod.checks import check_number
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.types import Floats, Ints
 from fastrod_device.can.bus import BusLine
@@ -309,7 +310,8 @@ class DriveBus:
         fault, or not there in time.
         """
         goal = whole(self.n_drives, target, "target")
-        _positive(velocity=velocity, acceleration=acceleration)
+        check_number("velocity", velocity)
+        check_number("acceleration", acceleration)
         self._cycle.require_enabled()
         far = max(abs(goal[i] - int(self._cycle.newest.position[i])) for i in range(self.n_drives))
         for i in range(self.n_drives):
@@ -365,7 +367,8 @@ class DriveBus:
                 f"speed is {speed!r}; it must be a positive number of counts/s, or one for "
                 f"each of {n} drives."
             )
-        _positive(acceleration=acceleration, time_limit=time_limit, rounds=rounds)
+        for name, value in (("acceleration", acceleration), ("time_limit", time_limit), ("rounds", rounds)):
+            check_number(name, value)
         away = [0] * n if offset is None else whole(self.n_drives, offset, "offset")
         drives = list(range(n)) if order is None else [int(i) for i in order]
         if sorted(drives) != list(range(n)):
@@ -438,12 +441,6 @@ class DriveBus:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _positive(**given: float) -> None:
-    for name, value in given.items():
-        if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} is {value!r}; it must be a positive number.")
 
 
 def _once(now: DriveFeedback) -> bool:  # noqa: ARG001

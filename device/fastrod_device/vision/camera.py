@@ -13,6 +13,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.tomlfile import parse, read_text
@@ -85,13 +86,6 @@ def _unit(value: ArrayLike, name: str) -> tuple[float, ...]:
     return tuple((array if abs(norm - 1.0) < 1e-12 else array / norm).tolist())
 
 
-def _positive(value: float, name: str, unit: str, low: float, high: float) -> None:
-    if isinstance(value, bool) or not (isinstance(value, (int, float)) and 0.0 < value < math.inf):
-        raise InputError(f"{name} is {shown(value)} {unit}; it must be a positive number.")
-    if not low <= value <= high:
-        raise InputError(f"{name} is {shown(value)} {unit}; it must be from {low:g} to {high:g} {unit}.")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Camera:
     """A camera: its lens and its pose. Raises `InputError` for what no camera can be.
@@ -141,13 +135,9 @@ class Camera:
                 f"numbers from {low} to {high} [px]."
             )
         put(self, "size", (int(size[0]), int(size[1])))
-        _positive(self.rate, "Camera.rate", "Hz", 0.01, 1e5)
-        if (
-            isinstance(self.latency, bool)
-            or not isinstance(self.latency, (int, float))
-            or not 0.0 <= self.latency < 10.0
-        ):
-            raise InputError(f"Camera.latency is {self.latency!r} s; it must be 0 to 10. Was it given in ms?")
+        check_number("Camera.rate", self.rate, Bound(least=0.01, most=1e5, unit="Hz"))
+        late = Bound(least=0.0, below=10.0, unit="s", hint="Was it given in ms?")
+        check_number("Camera.latency", self.latency, late)
 
     @property
     def intrinsics(self) -> Floats:
@@ -244,12 +234,11 @@ class Marker:
     """(4,) of tip_from_marker, w x y z."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.size, (int, float)) and self.size > 1.0:
-            raise InputError(f"Marker.size is {shown(self.size)} m; was it given in mm?")
-        _positive(self.size, "Marker.size", "m", 1e-4, 1.0)
+        check_number(
+            "Marker.size", self.size, Bound(least=1e-4, most=1.0, unit="m", hint="Was it given in mm?")
+        )
         n = len(dictionary_named(self.dictionary).bytesList)
-        if isinstance(self.id, bool) or not isinstance(self.id, int) or not 0 <= self.id < n:
-            raise InputError(f"Marker.id is {self.id!r}; {self.dictionary} has the numbers 0 to {n - 1}.")
+        check_number("Marker.id", self.id, Bound(least=0, most=n - 1), whole=True)
         object.__setattr__(self, "position", _tuple(self.position, "Marker.position", 3))
         object.__setattr__(self, "quaternion", _unit(self.quaternion, "Marker.quaternion"))
 

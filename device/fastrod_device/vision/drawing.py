@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 
+from fastrod.checks import Bound, check
 from fastrod.errors import InputError
 from fastrod.types import Floats, Singles
 from fastrod_device.vision.calibration import CharucoBoard
@@ -42,13 +43,13 @@ class DrawnScene:
     """Grey level of ink."""
     background: float | Picture = 110.0
     """Grey level around it, or a picture of the camera's size."""
-    blur: float = 0.7
+    blur: Annotated[float, Bound(least=0.0, most=50.0)] = 0.7
     """Standard deviation of the lens's blur [px]."""
-    noise: float = 2.0
+    noise: Annotated[float, Bound(least=0.0, most=50.0)] = 2.0
     """Standard deviation of a pixel [grey levels]."""
     gradient: tuple[float, float] = (0.1, 0.05)
     """Change of the light across the picture, to the right and down, as a part of it."""
-    vignetting: float = 0.08
+    vignetting: Annotated[float, Bound(least=0.0, most=50.0)] = 0.08
     """Light that is lost in the corners, as a part of it."""
 
     def __post_init__(self) -> None:
@@ -57,9 +58,7 @@ class DrawnScene:
                 f"Scene.black is {self.black!r} and white {self.white!r}; 0 <= black < white "
                 "<= 255 would be right."
             )
-        for name in ("blur", "noise", "vignetting"):
-            if not 0.0 <= getattr(self, name) < 50.0:
-                raise InputError(f"Scene.{name} is {getattr(self, name)!r}; it must be 0 to 50.")
+        check(self, "Scene.")
 
 
 @dataclass(frozen=True, eq=False)

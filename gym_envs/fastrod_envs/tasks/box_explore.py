@@ -9,7 +9,6 @@ from typing import ClassVar, final
 import numpy as np
 
 from fastrod.control import ResolvedRate
-from fastrod.errors import InputError
 from fastrod.hosts import BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.camera import Image
@@ -64,11 +63,6 @@ class BoxExploreOptions(EnvOptions):
     camera: bool = False
     """Observe also where in the tip's picture the cube's colour is seen; a picture of 48 x 36 pixels is drawn
     in each step."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not isinstance(self.camera, bool):
-            raise InputError(f"camera is {self.camera!r}; it must be True or False.")
 
 
 @final

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, final, get_args
+from typing import ClassVar, Literal, final
 
 import numpy as np
 
 from fastrod.control import ResolvedRate
-from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.gripper import Gripper
@@ -65,11 +64,6 @@ class PickPlaceOptions(EnvOptions):
 
     grip: Grip = "suction"
     """`suction`: the head holds what it touches; `gripper`: two fingers hold by friction."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.grip not in get_args(Grip):
-            raise InputError(f"grip is {self.grip!r}; it must be {' or '.join(map(repr, get_args(Grip)))}.")
 
 
 @final

@@ -9,7 +9,6 @@ from typing import ClassVar, Literal, final, get_args
 import numpy as np
 
 from fastrod.control import references
-from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 from fastrod.types import Floats, Ints
@@ -47,17 +46,6 @@ class TrackOptions(EnvOptions):
     reward: Reward = "paper"
     """`paper`: exp(-500 d^2) of the distance from the path; `precise`: exp(-e / 0.5 mm) on top, e from the
     nearest point in reach."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.path not in (*get_args(Shape), "any"):
-            raise InputError(
-                f"path is {self.path!r}; it must be 'any', {' or '.join(map(repr, get_args(Shape)))}."
-            )
-        if self.reward not in get_args(Reward):
-            raise InputError(
-                f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}."
-            )
 
 
 def fields(robot: Robot) -> tuple[tuple[Field, ...], tuple[Field, ...]]:

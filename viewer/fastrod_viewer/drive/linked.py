@@ -10,12 +10,12 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Protocol, final, runtime_checkable
+from typing import Annotated, Protocol, final, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fastrod.errors import InputError
+from fastrod.checks import Bound, check
 from fastrod.logs.link import Measurement, RobotLink
 from fastrod.logs.recording import Recorder
 from fastrod.types import Floats
@@ -27,15 +27,13 @@ _MAY_MOVE = ("ready", "running")
 class TendonLimits:
     """Limits of the tendons of a linked robot; a simulated one has none. Raises `InputError`."""
 
-    displacement: float = math.inf
+    displacement: Annotated[float, Bound(above=0.0, unit="m", infinite=True)] = math.inf
     """Largest change of a tendon's length, in either direction [m]."""
-    rate: float = math.inf
+    rate: Annotated[float, Bound(above=0.0, unit="m/s", infinite=True)] = math.inf
     """Largest rate of a tendon [m/s]."""
 
     def __post_init__(self) -> None:
-        for name in ("displacement", "rate"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"TendonLimits.{name} is {getattr(self, name)!r}; it must be positive.")
+        check(self)
 
 
 class Bounds(Protocol):

@@ -35,7 +35,7 @@ from fastrod_viewer.page import (
 )
 from fastrod_viewer.picture.canvas import Canvas
 from fastrod_viewer.picture.drawing import Drawing
-from fastrod_viewer.picture.options import FINE, ViewOptions
+from fastrod_viewer.picture.options import FINE, Body, ColorBy, ViewOptions
 from fastrod_viewer.worlds.world import World
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ _COMPILING = (
     "tight contact takes its time, too."
 )
 _GO_ON = "After a stop: commands are taken again, from where the robot stands."
-_COLORS = {
+_COLORS: dict[str, ColorBy] = {
     "segment": "segment",
     "curvature": "curvature",
     "surface strain": "strain",
@@ -68,7 +68,7 @@ _OPTION_LABELS = {
     "frames": "Tip frame",
 }
 _SPEEDS = {"real time": 1.0, "1/2": 1.0 / 2.0, "1/5": 1.0 / 5.0, "1/10": 1.0 / 10.0, "1/20": 1.0 / 20.0}
-_BODIES = {"backbone and tendons": "backbone", "skin": "skin"}
+_BODIES: dict[str, Body] = {"backbone and tendons": "backbone", "skin": "skin"}
 
 
 @final

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import POSITIVE, check
 from fastrod.control import ResolvedRate
 from fastrod.errors import FastrodError, InputError
 from fastrod.model.robot import Robot
@@ -41,18 +42,15 @@ _NOTHING = 1e-6  # m of a tendon, below which a robot is bent by its segments al
 class Speeds:
     """Largest rates, each positive. Raises `InputError`."""
 
-    bend: float = math.pi
+    bend: Annotated[float, POSITIVE] = math.pi
     """Speed of a segment's bend [rad/s]; tendons move no faster than this bend needs."""
-    extension: float = 0.5
+    extension: Annotated[float, POSITIVE] = 0.5
     """Speed of a segment's extension, in its own range a second [1/s]."""
-    base: float = 0.2
+    base: Annotated[float, POSITIVE] = 0.2
     """Speed of a base [m/s], and in rad/s five times that."""
 
     def __post_init__(self) -> None:
-        for name in ("bend", "extension", "base"):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
-                raise InputError(f"Speeds.{name} is {value!r}; it must be positive and finite.")
+        check(self)
 
     def times(self, factor: float) -> Speeds:
         """All of them, so many times as large."""

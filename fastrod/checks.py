@@ -1,0 +1,161 @@
+"""Bounds that the fields of a dataclass declare, and the one sentence for a value that breaks them.
+
+>>> from dataclasses import dataclass
+>>> @dataclass(frozen=True)
+... class Lens:
+...     angle: Annotated[float, Bound(above=0.0, below=180.0, unit="deg")] = 45.0
+...     def __post_init__(self) -> None:
+...         check(self)
+>>> Lens(angle=200)
+Traceback (most recent call last):
+fastrod.errors.InputError: Lens.angle is 200 deg; it must be a number between 0 and 180 deg.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from math import inf
+from sys import float_info
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+import numpy as np
+
+from fastrod.errors import InputError, nearest, shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bound:
+    """Range of a number: from `least` to `most`, or `above` and `below` what is out of it."""
+
+    least: float = -inf
+    most: float = inf
+    above: float = -inf
+    below: float = inf
+    unit: str = ""
+    infinite: bool = False
+    """Whether it may be infinite."""
+    hint: str = ""
+    """Question to whoever gives more than `most`, such as whether it was in mm."""
+
+    def holds(self, value: float) -> bool:
+        """Whether a number is within it."""
+        within = self.least <= value <= self.most and self.above < value
+        return within and (self.infinite or (value < self.below and abs(value) <= float_info.max))
+
+    def right(self, kind: str) -> str:
+        """Return what would be right: "a number from 0 to 1", say."""
+        low, high = max(self.least, self.above), min(self.most, self.below)
+        if low > -inf and high < inf:
+            joined = ("between", "and") if self.above > -inf or self.below < inf else ("from", "to")
+            unit = f" {self.unit}" if self.unit else ""
+            return f"{kind} {joined[0]} {_figure(low)} {joined[1]} {_figure(high)}{unit}"
+        if low > -inf:
+            zero = "positive" if self.above == 0.0 else "zero or positive"
+            ends = (
+                zero
+                if low == 0.0
+                else f"above {_figure(low)}"
+                if self.above > -inf
+                else f"at least {_figure(low)}"
+            )
+            return f"{kind}, {ends}{'' if kind.startswith('a whole') or self.infinite else ' and finite'}"
+        return f"{kind}, finite" if high == inf else f"{kind}, at most {_figure(high)}"
+
+
+def _figure(x: float) -> str:
+    return str(x) if isinstance(x, int) else f"{x:g}"
+
+
+POSITIVE = Bound(above=0.0)
+NOT_NEGATIVE = Bound(least=0.0)
+
+
+class Declared(NamedTuple):
+    """Values that a field may have."""
+
+    kind: type | None
+    """float, int or bool; None: one of `choices`."""
+    choices: tuple[Any, ...] = ()
+    bound: Bound = Bound()
+    optional: bool = False
+
+
+_KNOWN: dict[type, Mapping[str, Declared]] = {}  # read once
+
+
+def check(given: Any, prefix: str | None = None) -> None:
+    """Raise `InputError` for the first field of a dataclass that is not what it declares: a number of its
+    `Bound`, True or False, one of its `Literal`. `prefix` stands before the field's name in the sentence, by
+    default the class and a dot."""
+    before = f"{type(given).__name__}." if prefix is None else prefix
+    for name, declared in declared_by(type(given)).items():
+        check_value(f"{before}{name}", getattr(given, name), declared)
+
+
+def check_number(name: str, value: object, bound: Bound = POSITIVE, *, whole: bool = False) -> None:
+    """Raise `InputError` unless this is a number within the bound."""
+    check_value(name, value, Declared(int if whole else float, (), bound))
+
+
+def check_value(name: str, value: Any, declared: Declared) -> None:
+    """Raise `InputError` where a value is not what was declared."""
+    kind, choices, bound, optional = declared
+    if value is None and optional:
+        return
+    none = ", or None" if optional else ""
+    if kind is None:
+        if not any(value is one or (isinstance(value, type(one)) and value == one) for one in choices):
+            words = tuple(map(str, choices))
+            how = nearest(str(value), words) if isinstance(value, str) else ""
+            right = how if how.startswith("did") else f"it must be {' or '.join(map(repr, choices))}{none}."
+            raise InputError(f"{name} is {shown(value)}; {right}")
+        return
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise InputError(f"{name} is {shown(value)}; it must be True or False{none}.")
+        return
+    kinds = (int, np.integer) if kind is int else (int, float, np.integer, np.floating)
+    number = isinstance(value, kinds) and not isinstance(value, bool)
+    if not number or not bound.holds(value.item() if isinstance(value, np.generic) else value):
+        hint = f" {bound.hint}" if number and bound.hint and value > min(bound.most, bound.below) else ""
+        unit = f" {bound.unit}" if bound.unit else ""
+        right = bound.right("a whole number" if kind is int else "a number")
+        raise InputError(f"{name} is {shown(value)}{unit}; it must be {right}{none}.{hint}")
+
+
+def declared_by(cls: type) -> Mapping[str, Declared]:
+    """Field -> what it declares, of those that declare anything."""
+    if cls in _KNOWN:
+        return _KNOWN[cls]
+    found: dict[str, Declared] = {}
+    for field in fields(cls):
+        owner = next(one for one in cls.__mro__ if field.name in vars(one).get("__annotations__", ()))
+        try:
+            kind = eval(str(field.type), vars(sys.modules[owner.__module__]))
+        except NameError:  # a name that only a type checker imports
+            continue
+        if (declared := _declared(kind)) is not None:
+            found[field.name] = declared
+    _KNOWN[cls] = found
+    return found
+
+
+def _declared(kind: Any) -> Declared | None:
+    if get_origin(kind) is Annotated:
+        inner, *more = get_args(kind)
+        bound = next((one for one in more if isinstance(one, Bound)), None)
+        declared = _declared(inner) or Declared(int if int in (inner, *get_args(inner)) else float)
+        optional = NoneType in get_args(inner)
+        return None if bound is None else declared._replace(bound=bound, optional=optional)
+    if get_origin(kind) is Literal:
+        return Declared(None, get_args(kind))
+    if get_origin(kind) in (Union, UnionType) and all(get_origin(one) is Literal for one in get_args(kind)):
+        return Declared(None, tuple(choice for one in get_args(kind) for choice in get_args(one)))
+    if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
+        others = [one for one in get_args(kind) if one is not NoneType]
+        one = _declared(others[0]) if len(others) == 1 else None
+        return None if one is None else one._replace(optional=True)
+    return Declared(bool) if kind is bool else None
