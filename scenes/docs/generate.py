@@ -34,6 +34,7 @@ PAGES = {
     "viewer/README.md": "viewer.md",
     "viewer/film.gif": "film.gif",
     "viewer/first_page.png": "first_page.png",
+    "viewer/views.png": "views.png",
     "device/README.md": "prototype.md",
     "scenes/README.md": "scenes.md",
     "perf/README.md": "figures.md",
