@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from fastrod.checks import Bound, check_number
 from fastrod.effects.executor import SensedPoses, from_base
 from fastrod.errors import InputError
-from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
 from fastrod.solver import options
 from fastrod.solver.gpu import device as devices
@@ -364,6 +363,8 @@ class Simulator(RobotBatch):
             from fastrod.solver.motion import pose_at
 
             return pose_at(self._full("shape"), arclength)
+        from fastrod.kernels.rod.dense import between_nodes
+
         state, ports = self._full("shape"), self._last("shape")[1]
         s = arclengths(arclength, self.n_robots)
         check_on_robot(s, state)

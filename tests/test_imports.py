@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import grimp
 import pytest
 
@@ -50,6 +53,18 @@ def test_an_import_inside_a_function_is_one(graph: grimp.ImportGraph) -> None:
     assert "fastrod_viewer.worlds.hosted" in graph.find_modules_directly_imported_by(
         "fastrod_viewer.worlds.catalogue"
     )
+
+
+@pytest.mark.study
+def test_a_plain_simulator_needs_neither_contact_nor_modes() -> None:
+    code = (
+        "import sys, fastrod; robot = fastrod.load_robot('prototype'); "
+        "fastrod.Simulator(robot).settle(); print(*(m for m in sys.modules if m.startswith('fastrod')))"
+    )
+    words = [sys.executable, "-c", code]
+    loaded = subprocess.run(words, check=True, capture_output=True, text=True).stdout.split()
+    assert [name for name in loaded if ".contact" in name or ".modal" in name] == []
+    assert len(loaded) <= 55
 
 
 def test_a_circle_is_found() -> None:
