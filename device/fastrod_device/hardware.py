@@ -14,7 +14,7 @@ from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.loading import load_robot
 from fastrod.model.robot import Robot
-from fastrod.tomlfile import parse, read_text
+from fastrod.reading import parse, read_text
 from fastrod_device.drives import BusSpec
 from fastrod_device.safety import Limits
 from fastrod_device.units import DriveSpec, Transmission

@@ -19,6 +19,7 @@ import numpy as np
 from fastrod.checks import POSITIVE, Bound, check
 from fastrod.contact import trimesh_reader
 from fastrod.errors import InputError, nearest, shown
+from fastrod.reading import reading
 from fastrod.types import Floats, Ints
 
 _SMALL, _FEW = 4_000_000, 100  # bytes and bodies up to which a file is read in this process: at worst 2 s
@@ -69,20 +70,12 @@ def read_mesh(path: Path, limits: MeshLimits) -> tuple[Floats, Ints]:
             f"{where} has the unknown suffix {path.suffix!r}; {nearest(kind, FORMATS)} "
             "An archive, or a scene that refers to other files, is not read: save it as one of these."
         )
-    try:
+    hint = "; is it whole, and of that format?"
+    with reading(path, where, InputError, f"cannot be read as {kind}", most=sys.maxsize, hint=hint):
         size = path.stat().st_size
         _within(where, "bytes", size, "n_bytes", limits.n_bytes)
         with path.open("rb") as file:
             declared = _DECLARED[kind](file.fileno(), size) if size else None
-    except InputError:
-        raise
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        why = getattr(error, "strerror", None) or (
-            f"it lacks {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
-        )
-        raise InputError(
-            f"{where} cannot be read as {kind}: {why}; is it whole, and of that format?"
-        ) from error
     if declared is None:
         raise InputError(f"{where} is empty: it has 0 bytes.")
     _within(where, "faces", declared.faces, "n_faces", limits.n_faces)

@@ -14,6 +14,7 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.logs.bag import read_bag
+from fastrod.reading import reading
 from fastrod.types import Floats
 
 Table: TypeAlias = dict[str, Sequence[str] | Floats]
@@ -194,19 +195,16 @@ def _read_mat(path: Path) -> Table:
     of a struct as STRUCT_FIELD."""
     from scipy.io import loadmat, whosmat
 
-    try:
-        declared = sum(math.prod(shape) for _, shape, _ in whosmat(path))
-        if path.stat().st_size > _MOST_BYTES or declared > _MOST_VALUES:
-            raise LogError(
-                f"{path.name} declares {declared} values; a log may have {_MOST_VALUES}. Split it."
-            )
-        content = loadmat(path, squeeze_me=False, struct_as_record=True)
-    except NotImplementedError as error:
-        raise LogError(f"{path.name} is a MATLAB file of version 7.3; save it with -v7.") from error
-    except LogError:
-        raise
-    except Exception as error:  # of a damaged file scipy raises anything
-        raise LogError(f"{path.name} is not a MATLAB file: {str(error).rstrip('.')}.") from error
+    with reading(path, path.name, LogError, "is not a MATLAB file", most=_MOST_BYTES):
+        try:
+            declared = sum(math.prod(shape) for _, shape, _ in whosmat(path))
+            if declared > _MOST_VALUES:
+                raise LogError(
+                    f"{path.name} declares {declared} values; a log may have {_MOST_VALUES}. Split it."
+                )
+            content = loadmat(path, squeeze_me=False, struct_as_record=True)
+        except NotImplementedError as error:
+            raise LogError(f"{path.name} is a MATLAB file of version 7.3; save it with -v7.") from error
     every = {name: array for name, array in content.items() if not name.startswith("__")}
     for name, array in list(every.items()):
         if array.dtype.names and array.size == 1:

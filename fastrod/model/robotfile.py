@@ -18,7 +18,7 @@ from fastrod.errors import RobotError, UnknownNameError, nearest, shown
 from fastrod.model.logformat import LogFormat
 from fastrod.model.robot import MODES, Lump, Robot, Segment, Tendon
 from fastrod.model.taper import in_pieces
-from fastrod.tomlfile import parse, read_text
+from fastrod.reading import parse, read_text
 
 _LOG = tuple(f.name for f in fields(LogFormat))
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")

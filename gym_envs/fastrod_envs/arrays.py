@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from fastrod.errors import InputError
+from fastrod.reading import reading
 
 LARGEST = 64_000_000
 """Bytes that the arrays of a file may have, unless `read_arrays` is given another number; a shipped actor has
@@ -24,18 +25,17 @@ _KINDS = "fiubU"  # numbers, flags and words: no objects, which are pickles
 def read_arrays(path: Path, what: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
     """Arrays of a .npz by name. Raises `InputError` for a damaged, too large or foreign file, which is no
     `what`."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            total = sum(member.file_size for member in members)
-            if len(members) > _MOST or total > largest:
-                raise ValueError(
-                    f"it declares {len(members)} arrays of {total} bytes, more than {_MOST} or {largest}"
-                )
-            return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
-    except Exception as error:  # zipfile, zlib, numpy's headers: from BadZipFile to TokenError
-        why = getattr(error, "strerror", None) or str(error).rstrip(".") or type(error).__name__
-        raise InputError(f"{str(path)!r} is {what}, and it cannot be read: {why}; is it whole?") from error
+    where = f"{str(path)!r} is {what}, and it"
+    context = reading(path, where, InputError, most=4 * largest, hint="; is it whole?")
+    with context, zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        total = sum(member.file_size for member in members)
+        if len(members) > _MOST or total > largest:
+            raise ValueError(
+                f"it declares {len(members)} arrays of {total} bytes, more than {_MOST} or {largest}"
+            )
+        found = {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
+    return found  # noqa: RET504  (as in `read_text`)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compress: bool = False) -> None:

@@ -17,6 +17,7 @@ import msgspec
 
 from fastrod.checks import Bound, check
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
+from fastrod.reading import reading
 from fastrod_envs.actor import actor_of
 from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
 from fastrod_envs.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
@@ -141,9 +142,9 @@ def resume(
 def read_config(out: Path) -> tuple[TrainingPlan, dict[str, Any]]:
     """Plan and state of the training in a folder. Raises `InputError`, `UnknownNameError`."""
     path = out / CONFIG
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise ValueError(f"it has more than {_LARGEST} bytes")
+    hint = "; `fastrod train ENV --out DIR` writes one."
+    what = "is no configuration of a training"
+    with reading(path, repr(str(path)), InputError, what, most=_LARGEST, hint=hint):
         held = json.loads(path.read_text(encoding="utf-8"))
         plan = msgspec.convert(held["plan"], TrainingPlan)
         if unknown := held["plan"].keys() - {field.name for field in fields(TrainingPlan)}:
@@ -154,18 +155,6 @@ def read_config(out: Path) -> tuple[TrainingPlan, dict[str, Any]]:
         state = {**msgspec.convert(held["state"], dict[str, Any]), **msgspec.convert(held["state"], _State)}
         if not 0.0 <= state["seconds"] < float("inf"):
             raise ValueError(f"it says that {state['seconds']} s are done")
-    except UnknownNameError as error:
-        raise UnknownNameError(f"{str(path)!r}: {error}") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        why = (
-            f"it lacks {error}"
-            if isinstance(error, KeyError)
-            else getattr(error, "strerror", None) or str(error).rstrip(".")
-        )
-        raise InputError(
-            f"{str(path)!r} is no configuration of a training ({why}); `fastrod train ENV "
-            "--out DIR` writes one."
-        ) from error
     return plan, state
 
 

@@ -108,7 +108,7 @@ ALONE = {
         "no CAN interface 'soketcan'",
         DeviceError,
     ),
-    "no such EDS": (lambda: object_dictionary("none.eds"), "does not exist"),
+    "no such EDS": (lambda: object_dictionary("none.eds"), "No such file"),
     "node 0": (lambda: spec(node=0), "node"),
     "node 200": (lambda: spec(node=200), "node"),
     "no direction": (lambda: spec(direction=0), "direction"),

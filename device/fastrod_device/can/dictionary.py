@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fastrod.errors import InputError
+from fastrod.reading import reading
 from fastrod_device.can.bus import guest
 
 if TYPE_CHECKING:
@@ -46,17 +47,11 @@ def read_eds(path: Path) -> Any:
     Raises `InputError` in a sentence: no such file, no EDS, without objects, or with too many.
     """
     where = f"the EDS file {path}"
-    if not path.is_file():
-        raise InputError(f"{where} does not exist; give the path of the drive's .eds file, or none.")
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise InputError(f"{where} cannot be read: it is larger than {_LARGEST // 2**20} MiB.")
-        sections = _sections(_text(path.read_bytes()))
-    except OSError as error:
-        raise InputError(f"{where} cannot be read: {error.strerror or error}.") from error
-    except Error as error:
-        why = " ".join(str(error).split())
-        raise InputError(f"{where} cannot be read: it is no EDS ({why}).") from error
+    with reading(path, where, InputError, most=_LARGEST):
+        try:
+            sections = _sections(_text(path.read_bytes()))
+        except Error as error:
+            raise ValueError(f"it is no EDS ({' '.join(str(error).split())})") from error
     if not sections:
         raise InputError(f"{where} describes no object; an EDS has sections such as [6040].")
     members = {key: _members(options) for key, options in sections.items()}

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
+from fastrod.reading import parse, read_text
 from fastrod.rotation import matrix_from_quaternion, product
-from fastrod.tomlfile import parse, read_text
 from fastrod.types import Floats
 from fastrod_device.can.clock import Clock, WallClock
 from fastrod_device.errors import DeviceError
