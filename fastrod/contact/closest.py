@@ -4,7 +4,6 @@ and the plain twins of the shapes stand on, and the kernels do not."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TypeAlias
 
 from fastrod.contact.normals import EDGE_AB, EDGE_BC, EDGE_CA, FACE, VERTEX_A, VERTEX_B, VERTEX_C
@@ -12,8 +11,6 @@ from fastrod.contact.normals import EDGE_AB, EDGE_BC, EDGE_CA, FACE, VERTEX_A, V
 Triple: TypeAlias = tuple[float, float, float]
 Signed: TypeAlias = tuple[float, Triple]
 """Signed distance [m] and its gradient, in the frame of the obstacle."""
-
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def _dot(a: Triple, b: Triple) -> float:
@@ -75,36 +72,6 @@ def on_segment(p: Triple, a: Triple, d: Triple) -> float:
     return min(max(_dot(_sub(p, a), d) / square, 0.0), 1.0) if square > 0.0 else 0.0
 
 
-def segments(a: Triple, d: Triple, b: Triple, e: Triple) -> tuple[float, float]:
-    """Fractions of the segments a, a + d and b, b + e that are closest to each other (Ericson 2005,
-    5.1.9)."""
-    dd, de, ee, r = _dot(d, d), _dot(d, e), _dot(e, e), _sub(a, b)
-    det = dd * ee - de * de
-    s = min(max((de * _dot(e, r) - ee * _dot(d, r)) / det, 0.0), 1.0) if det > 0.0 else 0.0
-    t = on_segment(along(a, d, s), b, e)
-    return on_segment(along(b, e, t), a, d), t
-
-
-def segment_triangle(p: Triple, q: Triple, a: Triple, b: Triple, c: Triple) -> tuple[float, Triple]:
-    """Fraction of the segment p-q and point of the triangle closest to each other; where it crosses, the
-    crossing."""
-    d = _sub(q, p)
-    n = _cross(_sub(b, a), _sub(c, a))
-    hp, hq = _dot(n, _sub(p, a)), _dot(n, _sub(q, a))
-    if hp * hq <= 0.0 and hp != hq:
-        t = hp / (hp - hq)
-        x = along(p, d, t)
-        sides = (_dot(n, _cross(_sub(v, u), _sub(x, u))) for u, v in ((a, b), (b, c), (c, a)))
-        if all(side >= 0.0 for side in sides):
-            return t, x
-    near = [(0.0, on_triangle(p, a, b, c)[0]), (1.0, on_triangle(q, a, b, c)[0])]
-    for u, v in ((a, b), (b, c), (c, a)):
-        near.append((on_segment(u, p, d), u))
-        s, t = segments(p, d, u, _sub(v, u))
-        near.append((s, along(u, _sub(v, u), t)))
-    return min(near, key=lambda pair: math.dist(along(p, d, pair[0]), pair[1]))
-
-
 def corner(depth: tuple[float, ...], outward: tuple[Triple, ...]) -> Signed:
     """Signed distance to a convex corner of walls at right angles, from that to each wall and the wall's
     outward normal."""
@@ -115,20 +82,3 @@ def corner(depth: tuple[float, ...], outward: tuple[Triple, ...]) -> Signed:
         return depth[k], outward[k]
     x, y, z = (sum(v * n[i] for v, n in zip(out, outward, strict=True)) / r for i in range(3))
     return r, (x, y, z)
-
-
-def lowest(at: Callable[[float], float]) -> float:
-    """Return where a convex function is least between 0 and 1, by golden section."""
-    low, high = 0.0, 1.0
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    f_left, f_right = at(left), at(right)
-    while high - low > 1e-12:
-        if f_left <= f_right:
-            high, right, f_right = right, left, f_left
-            left = high - _GOLDEN * (high - low)
-            f_left = at(left)
-        else:
-            low, left, f_left = left, right, f_right
-            right = low + _GOLDEN * (high - low)
-            f_right = at(right)
-    return min((0.0, 1.0, 0.5 * (low + high)), key=at)

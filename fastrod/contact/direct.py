@@ -6,10 +6,6 @@ asked follows from measurements against brute force (python-fcl 0.7):
 
 - a point is a sphere of radius 0 against the mesh: face and distance right to 1e-17 m; 11-33 us a query, 12
   to 20 000 faces;
-- a segment a-b is the one-triangle mesh (a, a, b), given first; 20-45 us a question. Where it is exactly
-  parallel to a face FCL's triangle distance misses by up to 6 mm: in 1 of 100 such cases with the obstacle
-  first, 1 of 5000 with the segment first, none of 10 000 once its end is moved by 1e-12 to 1e-9 of its
-  length. So it is asked twice, as it is and with its end moved, and the nearer face counts;
 - a capsule is never asked: libccd's iteration is off by up to 5e-5 m (radius 1e-6), and slower, 100-130 us;
 - FCL drops the inside of a triangle whose doubled area squared is below 1e-15, in its own unit, so that a
   mesh of 0.2 mm triangles in metres is wrong by 0.02 mm: here the BVH is in units that are small enough, a
@@ -22,16 +18,15 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import objmode
 
-from fastrod.contact.closest import Triple, along, lowest, on_triangle, segment_triangle
+from fastrod.contact.closest import Triple, on_triangle
 from fastrod.contact.geometry import Obstacle
 from fastrod.contact.normals import pseudonormals
-from fastrod.contact.primitive import primitive_of
 from fastrod.errors import InputError
 from fastrod.kernels.contact.primitive import DISTANCE
 from fastrod.kernels.jit import pointed
@@ -39,38 +34,6 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats
 
 _AT_SURFACE = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
-_NUDGE: Floats = 1e-11 * np.array([0.31, 0.57, 0.76])
-"""Per length, in a direction that no face is likely to have: takes a segment out of being exactly parallel to
-one."""
-
-
-class Closest(NamedTuple):
-    """The closest point of an obstacle's surface to a point."""
-
-    distance: float
-    """Signed, negative inside [m]."""
-    normal: Floats
-    """(3,) gradient of the signed distance: unit, outward, world."""
-    point: Floats
-    """(3,) on the surface, world [m]."""
-    face: int
-    """Index of the face in `Obstacle.faces`, -1 for a primitive."""
-
-
-class SegmentClosest(NamedTuple):
-    """The closest points of an obstacle and a segment a-b."""
-
-    distance: float
-    """A mesh: to its surface, unsigned, 0 where the segment crosses it. A primitive: the smallest signed
-    distance along it [m]."""
-    point: Floats
-    """(3,) on the surface, world [m]; one of them where the segment crosses more than once."""
-    on_segment: Floats
-    """(3,) on the segment, world [m]."""
-    fraction: float
-    """Fraction along the segment at which `on_segment` lies: 0 at a, 1 at b."""
-    face: int
-    """Index of the face in `Obstacle.faces`, -1 for a primitive."""
 
 
 class _Mesh:
@@ -103,14 +66,6 @@ class _Mesh:
         away, outward = p - np.array(on_surface), self.normals[face, feature]
         distance = math.copysign(math.hypot(*away), float(away @ outward))
         return distance, away / distance if abs(distance) > _AT_SURFACE else outward, on_surface, face
-
-    def face_near(self, p: Floats, q: Floats) -> int:
-        """The face that FCL calls closest to the segment p-q, obstacle frame [m]."""
-        fcl = _fcl()
-        answer = fcl.DistanceResult()
-        line = _bvh(np.stack([p, p, q]) * self.scale, np.array([[0, 1, 2]]))
-        fcl.distance(line, self.body, fcl.DistanceRequest(), answer)
-        return int(answer.b2)
 
 
 _MESHES: WeakKeyDictionary[Obstacle, _Mesh] = WeakKeyDictionary()
@@ -213,102 +168,6 @@ def _note(_one: Any, _other: Any, met: list[bool]) -> bool:
     return True  # one is enough
 
 
-class DirectScene:
-    """Closest points by FCL, one BVH per mesh (built once, shared between scenes of the same Obstacle
-    object).
-
-    Obstacles stand at their rest pose until `place` moves them. `point` and `segment` raise `InputError` for
-    an obstacle that the scene does not have and for coordinates that are not three finite numbers.
-    """
-
-    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
-        self.obstacles = tuple(obstacles)
-        self._meshes: list[_Mesh | None] = []
-        self._position: list[Floats] = [np.zeros(3)] * len(self.obstacles)
-        self._rotation: list[Floats] = [np.eye(3)] * len(self.obstacles)
-        for k, obstacle in enumerate(self.obstacles):
-            if obstacle.shape == "mesh" and obstacle not in _MESHES:
-                _MESHES[obstacle] = _Mesh(obstacle)
-            self._meshes.append(_MESHES[obstacle] if obstacle.shape == "mesh" else None)
-            self.place(k, obstacle.position, obstacle.quaternion)
-
-    def place(self, k: int, position: Sequence[float] | Floats, quaternion: Sequence[float] | Floats) -> None:
-        """Stand obstacle `k` at world_from_obstacle: position [m], quaternion w x y z, its norm 1 within
-        1e-6."""
-        self._check(k)
-        at, rotation = _finite("position", position, 3), _finite("quaternion", quaternion, 4)
-        norm = float(np.linalg.norm(rotation))
-        if abs(norm - 1.0) > 1e-6:
-            raise InputError(
-                f"quaternion of obstacle {self.obstacles[k].name!r} has norm {norm:.6g}; it must be 1."
-            )
-        self._position[k] = at
-        self._rotation[k] = matrix_from_quaternion(rotation[None] / norm)[0]
-
-    def point(self, k: int, p: Sequence[float] | Floats) -> Closest:
-        """Signed distance of the world point `p` (3,) [m] to the surface of obstacle `k`, and where that
-        is."""
-        self._check(k)
-        at, rotation = self._position[k], self._rotation[k]
-        world = _finite("point", p, 3)
-        local = rotation.T @ (world - at)
-        mesh = self._meshes[k]
-        if mesh is None:
-            obstacle = self.obstacles[k]
-            distance, gradient = primitive_of(obstacle.shape).plain(obstacle.size, _triple(local))
-            normal = rotation @ np.array(gradient)
-            return Closest(distance, normal, world - distance * normal, -1)
-        distance, normal, on_surface, face = mesh.at(local)
-        return Closest(distance, rotation @ normal, rotation @ np.array(on_surface) + at, face)
-
-    def segment(self, k: int, a: Sequence[float] | Floats, b: Sequence[float] | Floats) -> SegmentClosest:
-        """Distance of the world segment from `a` to `b`, each (3,) [m], to obstacle `k`, and where that
-        is."""
-        self._check(k)
-        at, rotation = self._position[k], self._rotation[k]
-        start, end = _finite("segment start", a, 3), _finite("segment end", b, 3)
-        p, q = rotation.T @ (start - at), rotation.T @ (end - at)
-        mesh = self._meshes[k]
-        if mesh is None:
-            fraction = _lowest(self.obstacles[k], p, q)
-            size, signed = self.obstacles[k].size, primitive_of(self.obstacles[k].shape).plain
-            distance, gradient = signed(size, _triple(p + fraction * (q - p)))
-            on_segment = start + fraction * (end - start)
-            return SegmentClosest(
-                distance, on_segment - distance * (rotation @ np.array(gradient)), on_segment, fraction, -1
-            )
-        found = []
-        for face in {mesh.face_near(p, q), mesh.face_near(p, q + math.dist(p, q) * _NUDGE)}:
-            fraction, nearest = segment_triangle(_triple(p), _triple(q), *mesh.corners[face])
-            found.append((math.dist(p + fraction * (q - p), nearest), face, fraction, nearest))
-        distance, face, fraction, nearest = min(found)
-        return SegmentClosest(
-            distance, rotation @ np.array(nearest) + at, start + fraction * (end - start), fraction, face
-        )
-
-    def _check(self, k: int) -> None:
-        if not 0 <= k < len(self.obstacles):
-            raise InputError(
-                f"there is no obstacle {k!r}; the scene has {len(self.obstacles)}, numbered from 0."
-            )
-
-
-def _finite(what: str, values: Sequence[float] | Floats, count: int) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise InputError(f"{what} is {values!r}; it must be {count} finite numbers.")
-    return array
-
-
 def _triple(v: Floats) -> Triple:
     x, y, z = v.tolist()
     return x, y, z
-
-
-def _lowest(obstacle: Obstacle, p: Floats, q: Floats) -> float:
-    """Fraction of the segment p-q, obstacle frame, where the signed distance to a primitive is least; it is
-    convex along it."""
-    primitive, a, d = primitive_of(obstacle.shape), _triple(p), _triple(q - p)
-    if primitive.lowest is not None:
-        return primitive.lowest(obstacle.size, a, d)
-    return lowest(lambda t: primitive.plain(obstacle.size, along(a, d, t))[0])

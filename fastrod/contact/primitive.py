@@ -60,9 +60,6 @@ class Primitive:
     """(trimesh, size) -> a new trimesh.Trimesh."""
     twin: Distance | None = None
     """`distance` once more, written another way in plain Python, for the direct path; None: itself."""
-    lowest: Callable[[Triple, Triple, Triple], float] | None = None
-    """(size, p, d) -> where on the segment p, p + d, between 0 and 1, the distance is least, where that has a
-    closed form."""
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.isidentifier() and self.name != "mesh"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,31 +21,6 @@ class Column:
     """SI; empty for what has none."""
     about: str
     """Description in a few words."""
-
-
-class ColumnWork(Protocol):
-    """Content of a shard, and how it is made. A frozen dataclass of plain numbers and words, so that it can
-    be written and compared."""
-
-    @property
-    def index(self) -> str:
-        """The column that counts from 0 over the whole data set: `row`, or `episode` where one has several
-        rows."""
-        ...
-
-    @property
-    def usual(self) -> int:
-        """Rows (or episodes) of a shard by default: some seconds of work."""
-        ...
-
-    def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
-        """The columns of the `count` rows (or episodes) from `first` on. `seed` is the shard's own; the same
-        call makes the same bits."""
-        ...
-
-    def failed(self, columns: Sequence[Column]) -> int:
-        """Number of rows (or episodes) that did not succeed; they are kept, and marked."""
-        ...
 
 
 def several(names: Sequence[str], values: NDArray[Any], unit: str, about: str) -> list[Column]:

@@ -7,11 +7,10 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from contact.directscene import DirectScene
 from numpy.testing import assert_allclose
 
 from fastrod.contact import box, capsule, cylinder, ellipsoid, mesh, plane, sphere
-from fastrod.contact.direct import DirectScene
-from fastrod.errors import InputError
 from fastrod.rotation import matrix_from_quaternion
 
 EXACT = 1e-12  # m: the face is FCL's, the rest a closed form in double precision on 0.1 m
@@ -386,15 +385,3 @@ def test_segment_of_a_primitive_is_its_lowest_point(obstacle):
         assert found.distance >= min(along) - 0.005 * math.dist(a, b)
         assert scene.point(0, found.on_segment).distance == pytest.approx(found.distance, abs=EXACT)
         assert math.dist(found.point, found.on_segment) == pytest.approx(abs(found.distance), abs=EXACT)
-
-
-def test_what_cannot_be_asked_is_refused():
-    scene = DirectScene([sphere(0.1, name="ball")])
-    with pytest.raises(InputError, match="no obstacle 1; the scene has 1"):
-        scene.point(1, (0.0, 0.0, 0.0))
-    with pytest.raises(InputError, match=r"point is .*; it must be 3 finite numbers"):
-        scene.point(0, (0.0, math.nan, 0.0))
-    with pytest.raises(InputError, match="segment end"):
-        scene.segment(0, (0.0, 0.0, 0.0), (1.0, 2.0))
-    with pytest.raises(InputError, match=r"quaternion of obstacle 'ball' has norm 2"):
-        scene.place(0, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0))

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from contact.directscene import DirectScene
 from numba import njit
 from numpy.testing import assert_allclose
 
 from fastrod.contact import Obstacle, box, capsule, cylinder, ellipsoid, mesh, plane, sphere
-from fastrod.contact.direct import DirectScene
 from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
 from fastrod.kernels.contact.bvh import FAR, LEAF_CODE, STACK

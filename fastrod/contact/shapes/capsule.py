@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Unpack
 
-from fastrod.contact.closest import Signed, Triple, along, on_segment, segments
+from fastrod.contact.closest import Signed, Triple
 from fastrod.contact.geometry import Obstacle, Placement, obstacle
 from fastrod.contact.primitive import Primitive, register
 from fastrod.kernels.vec import Vec, unit
@@ -37,13 +37,6 @@ def _twin(size: Triple, p: Triple) -> Signed:
     return r - size[0], ((v[0] / r, v[1] / r, v[2] / r) if r > 0.0 else (1.0, 0.0, 0.0))
 
 
-def _lowest(size: Triple, p: Triple, d: Triple) -> float:
-    length = size[1]
-    crossing = segments(p, d, (0.0, 0.0, -0.5 * length), (0.0, 0.0, length))[0]
-    ends = (on_segment((0.0, 0.0, z * length), p, d) for z in (-0.5, 0.5))
-    return min((crossing, 0.0, 1.0, *ends), key=lambda t: _twin(size, along(p, d, t))[0])
-
-
 register(
     Primitive(
         name="capsule",
@@ -54,6 +47,5 @@ register(
         width=lambda size: 2.0 * size[0] + size[1],
         drawing=lambda lib, size: lib.creation.capsule(radius=size[0], height=size[1]),
         twin=_twin,
-        lowest=_lowest,
     )
 )

@@ -63,6 +63,5 @@ register(
         width=lambda _: math.inf,
         drawing=lambda lib, _: lib.Trimesh(_SQUARE, [(0, 1, 2), (0, 2, 3)], process=False),
         twin=_twin,
-        lowest=lambda _, __, d: 1.0 if d[2] < 0.0 else 0.0,
     )
 )

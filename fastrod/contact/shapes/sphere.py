@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Unpack
 
-from fastrod.contact.closest import Signed, Triple, on_segment
+from fastrod.contact.closest import Signed, Triple
 from fastrod.contact.geometry import Obstacle, Placement, obstacle
 from fastrod.contact.primitive import Primitive, register
 from fastrod.kernels.vec import Vec, dot, unit
@@ -41,6 +41,5 @@ register(
         width=lambda size: 2.0 * size[0],
         drawing=lambda lib, size: lib.creation.icosphere(subdivisions=3, radius=size[0]),
         twin=_twin,
-        lowest=lambda _, p, d: on_segment((0.0, 0.0, 0.0), p, d),
     )
 )
