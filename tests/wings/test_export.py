@@ -1,12 +1,11 @@
 """The exported page: whole, offline, and with our words in it."""
 
 import socket
-from pathlib import Path
 
 import pytest
 
 from fastrod.errors import InputError
-from fastrod_viewer.export import external_references, legend, wrap, write_page
+from fastrod_viewer.export import external_references, legend, wrap
 
 PAGE = (
     "<!doctype html><html><head><title>Viser</title><script>const "
@@ -77,25 +76,6 @@ def test_a_page_that_would_load_something_is_refused() -> None:
         wrap(PAGE, title="t", legend_html='<img src="https://a.org/x.png">')
     with pytest.raises(InputError, match="is not a page"):
         wrap("<p>no head</p>", title="t")
-
-
-def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "page.html"
-    assert write_page(PAGE, path) == path
-    assert path.read_text(encoding="utf-8") == PAGE
-    write_page(PAGE + "<!-- µ -->", path)
-    assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
-    for folder in ("folder.html", "taken.html.part"):
-        (tmp_path / folder).mkdir()
-    for name, sentence in {
-        "none/page.html": "make it",
-        "page.txt": r"does not end in .html",
-        "folder.html": "is a folder",
-        "taken.html": "cannot be written",
-    }.items():
-        with pytest.raises(InputError, match=sentence):
-            write_page(PAGE, tmp_path / name)
-    assert not (tmp_path / "none").exists()
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from html import escape
 from html.parser import HTMLParser
 from importlib.resources import files
-from pathlib import Path
 
 from fastrod.errors import InputError
 
@@ -92,29 +91,6 @@ def external_references(html: str) -> list[str]:
     reader.feed(html)
     reader.close()
     return reader.found
-
-
-def write_page(html: str, path: str | Path) -> Path:
-    """Write `html` to `path`, whole or not at all; the path. Raises `InputError` where it cannot be written;
-    makes no folder."""
-    target = Path(path)
-    if target.suffix not in (".html", ".htm"):
-        raise InputError(f"{str(path)!r} does not end in .html; a page does.")
-    if not target.parent.is_dir():
-        raise InputError(
-            f"folder {str(target.parent)!r} is not there; make it, or write the page somewhere else."
-        )
-    if target.is_dir():
-        raise InputError(f"{str(path)!r} is a folder; give the file to write the page to.")
-    partial = target.with_name(target.name + ".part")
-    try:
-        partial.write_text(html, encoding="utf-8")
-        partial.replace(target)
-    except OSError as error:
-        if partial.is_file():
-            partial.unlink()
-        raise InputError(f"{str(path)!r} cannot be written: {error.strerror or error}.") from error
-    return target
 
 
 def _panel(title: str, subtitle: str, legend_html: str, facts: Sequence[tuple[str, str]], note: str) -> str:

@@ -67,11 +67,6 @@ class PlayedTrack:
     """Rms of `residual` over the whole log [m]."""
     shapes: PlayedShapes
 
-    def rms_of(self, rows: Flags) -> float:
-        """Root mean square of `residual` over the rows (n,) [m]; nan where none of them counts."""
-        squares = self.residual[rows & np.isfinite(self.residual)] ** 2
-        return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
