@@ -16,7 +16,7 @@ from fastrod.types import Floats, Ints, Ports
 
 
 def copied_acting(modal: ModalSolver, acting: Acting) -> Acting:
-    """What acts now, in arrays of its own; the gravity that the robots have where none was given."""
+    """All that acts now, in arrays of its own; the gravity that the robots have where none was given."""
     return acting._replace(
         ports=acting.ports._replace(**{k: np.array(a, order="C") for k, a in acting.ports._asdict().items()}),
         params=acting.params._replace(

@@ -14,7 +14,7 @@ from fastrod.errors import Problem
 from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.guess import unloaded
 from fastrod.solver.observer import DIVERGED, ObserverSolver
-from fastrod.solver.protocol import Acting, How, Last, Response, Solved
+from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, sentence_of
 from fastrod.solver.response import Linear, stretch
 from fastrod.solver.settle import LOST, frozen_noise, frozen_pass, settle
@@ -81,7 +81,7 @@ class ContactObserver(ObserverSolver):
         used = np.where(ok, solver.used, -1)
         return Solved(shape, ok, used, ports, "contact", Problem.CONTACT_STUCK, problems, lost, held)
 
-    def response(self, acting: Acting, warm: Flags) -> Response:
+    def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape, contact forces held."""
         self.passes.params = acting.params
         rows = np.flatnonzero(warm)

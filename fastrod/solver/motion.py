@@ -19,7 +19,7 @@ from fastrod.solver.inputs import Inputs, arclengths
 from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, no_hosts
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.options import Modal, Modes
-from fastrod.solver.protocol import Acting, How, Last, Response, Solved
+from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.state import MOVING, Pose, State, check_on_robot
 from fastrod.solver.stepper import PassShapes, TimeStepper, copied
 from fastrod.solver.tape import Tape
@@ -187,7 +187,7 @@ class ModalRods:
         pose[:, 3:] = product(quaternion_from_vector(host.moved[:, 3:]), pose[:, 3:])
         return ports._replace(base_pose=pose)
 
-    def response(self, acting: Acting, warm: Flags) -> Response:
+    def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape."""
         return self.linear(acting, warm)
 

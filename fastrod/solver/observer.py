@@ -14,7 +14,7 @@ from fastrod.solver.gpu.device import Device
 from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.options import Observer
-from fastrod.solver.protocol import Acting, How, Last, Response, Solved
+from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.recovery import Boundary, unstable
 from fastrod.solver.response import Linear, stretch
 from fastrod.solver.settle import LOST, frozen_pass, settle
@@ -155,7 +155,7 @@ class ObserverSolver:
             return np.zeros(len(self._all), bool)
         return np.asarray(last.warm & (last.state.residual < tolerance))
 
-    def response(self, acting: Acting, warm: Flags) -> Response:
+    def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape."""
         self.passes.params = acting.params
         return Linear(self.passes, np.flatnonzero(warm), acting.ports)

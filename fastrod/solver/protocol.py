@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 from numpy.typing import ArrayLike
@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike
 from fastrod.errors import Problem, ProblemSentence
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
+from fastrod.solver.response import Relocate
 from fastrod.solver.state import State
 from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
-
-Relocate = Callable[[Floats], dict[str, Floats]]
-"""Loads at other extensions: point forces stay at their arclength."""
 
 
 class Acting(NamedTuple):
@@ -39,7 +37,7 @@ class Last(NamedTuple):
 
 
 class How(NamedTuple):
-    """How a step is taken."""
+    """Options of one step."""
 
     dt: float
     passes: int = 1
@@ -74,7 +72,7 @@ class Solved(NamedTuple):
     """By the inputs, where it came with the step."""
 
 
-class Response(Protocol):
+class LinearResponse(Protocol):
     """Linear response of the last shape."""
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
@@ -112,7 +110,7 @@ class Solver(Protocol):
         """Bring these robots to rest, to `tolerance` [m]."""
         ...
 
-    def response(self, acting: Acting, warm: Flags) -> Response:
+    def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape of these robots."""
         ...
 

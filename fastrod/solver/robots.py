@@ -55,7 +55,7 @@ class RobotBatch:
     """Robots of one layout, from one call to the next."""
 
     _rods: Solver
-    """How they are solved; set by `Simulator`."""
+    """Solver of the rods; set by `Simulator`."""
 
     def __init__(
         self,
@@ -402,7 +402,7 @@ class RobotBatch:
 
 
 def _merged(moving: Mapping[str, Any], then: State, rows: Flags) -> dict[str, Any]:
-    """What rods have in motion, with `rows` as in another state."""
+    """Fields of rods in motion, with `rows` as in another state."""
     if then.velocity is None:
         return {}
     pairs = {name: (moving[name], getattr(then, name)) for name in MOVING}

@@ -20,7 +20,7 @@ from fastrod.identification.log.unknowns import effect_unknowns
 from fastrod.identification.report.headline import _found
 from fastrod.identification.report.result import Found
 from fastrod.identification.report.signals import Signals
-from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.identification.search.search import Search
 from fastrod.model.routing import route
 
@@ -105,7 +105,7 @@ def test_a_report_draws_it_against_its_signal(package: None) -> None:
 
 
 def test_its_bound_is_among_the_first(package: None) -> None:
-    bounds = [Bound(name, "rate", "1/s", 0.1) for name in (*effect_names()[:8], "worn_cable")]
+    bounds = [DetectionLimit(name, "rate", "1/s", 0.1) for name in (*effect_names()[:8], "worn_cable")]
     result: Any = SimpleNamespace(effects=[], patterns=[], verdict="none", bounds=bounds)
     assert "worn cable" in _found(result).lower()
 

@@ -13,7 +13,7 @@ import numpy as np
 from fastrod.identification.log.noise import Noise
 from fastrod.identification.log.registration import CameraRegistration
 from fastrod.identification.report.signature import Signature
-from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.revisits import Revisits
 from fastrod.identification.search.solve import Estimate
@@ -131,7 +131,7 @@ class Result:
     """Patterns of the remaining structure, where a pattern outside the library fits it."""
     tried: Sequence[Tried]
     path: Sequence[SearchStage]
-    bounds: Sequence[Bound]
+    bounds: Sequence[DetectionLimit]
     advice: Sequence[str]
     notes: Sequence[str]
     """Remarks on what is unusual in this log."""

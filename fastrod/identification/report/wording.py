@@ -8,7 +8,7 @@ import math
 import re
 
 from fastrod.effects.base import get_effect, trait
-from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.identification.search.motion import DAMPING, INERTIA, KelvinVoigtDamping, RodInertia
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import OneSidedTendons
@@ -142,7 +142,7 @@ def law(name: str) -> dict[str, str]:
     return {key: " ".join(value.split()) for key, value in found}
 
 
-def bound_sentence(bound: Bound) -> str:
+def bound_sentence(bound: DetectionLimit) -> str:
     """Return the sentence on the smallest size at which an effect would have shown."""
     stem = re.sub(r"_([xyz]|\d+)$", "", bound.parameter)
     noun = _NOUNS.get(

@@ -98,7 +98,7 @@ class SearchStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Bound:
+class DetectionLimit:
     """The size from which an effect would have shown."""
 
     name: str

@@ -34,8 +34,8 @@ from fastrod.identification.search.model_selection import (
     Z_KEEP,
     Z_RIVAL,
     Z_STRONG,
-    Bound,
     Candidate,
+    DetectionLimit,
     ModelState,
     SearchStep,
     advantage,
@@ -610,7 +610,7 @@ class Search:
             state, left = weakest[2], [name for name in left if name != weakest[1]]
         return state, left
 
-    def bounds(self, state: ModelState) -> list[Bound]:
+    def bounds(self, state: ModelState) -> list[DetectionLimit]:
         """For every effect that is not in the model, the size from which it would have shown: three standard
         errors beyond its estimate, at the typical shape. What `state` leaves counts as noise."""
         # of what is left, which counts as noise; what was found and is not named is in it
@@ -657,7 +657,9 @@ class Search:
                 worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * stderr)
                 units[key] = u.unit
             made += [
-                Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan"))
+                DetectionLimit(
+                    name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan")
+                )
                 for key, size in worst.items()
             ]
         return made
