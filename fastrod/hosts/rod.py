@@ -17,6 +17,7 @@ from fastrod.contact.frames import between
 from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
 from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Freedom, Motion
+from fastrod.hosts.rigid import rigid_exchange, rigid_inertia
 from fastrod.model.robot import Robot
 from fastrod.rotation import displaced, displacement, quaternion_from_matrix
 from fastrod.simulator import Simulator
@@ -24,7 +25,6 @@ from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_shape
 from fastrod.solver.motion import checked_mobility
 from fastrod.solver.options import Modal, Modes
-from fastrod.solver.rigid import rigid_exchange, rigid_inertia
 from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints
 

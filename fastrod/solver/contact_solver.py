@@ -12,12 +12,11 @@ from fastrod.contact.frames import blended
 from fastrod.contact.step import COLD_ITERATIONS, ContactStep, empty_loads
 from fastrod.errors import Problem
 from fastrod.solver.boundary import BoundarySolver
-from fastrod.solver.guess import unloaded
 from fastrod.solver.observer import DIVERGED, ObserverSolver
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, sentence_of
 from fastrod.solver.response import Linear, stretch
-from fastrod.solver.settle import LOST, frozen_noise, frozen_pass, settle
+from fastrod.solver.settle import LOST, frozen_noise, frozen_pass, settle, unloaded
 from fastrod.types import Flags, Floats, Ints, PointLoads, Ports, RodShape
 
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own

@@ -11,13 +11,12 @@ from fastrod.errors import InputError, Problem, shown
 from fastrod.model.robot import Robot
 from fastrod.solver.boundary import BoundarySolver, new_shape
 from fastrod.solver.gpu.device import Device
-from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.options import Observer
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.recovery import Boundary, unstable
 from fastrod.solver.response import Linear, stretch
-from fastrod.solver.settle import LOST, frozen_pass, settle
+from fastrod.solver.settle import LOST, cold_start, frozen_pass, settle
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, RodShape
 
 DIVERGED = "the observer diverged, and no shape was found on these inputs"

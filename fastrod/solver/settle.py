@@ -4,13 +4,30 @@ load continuation."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from fastrod.kernels.rod.cold import begin
 from fastrod.solver.boundary import BoundarySolver
-from fastrod.solver.guess import cold_start
-from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
+from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, RodShape
+
+_LOADS = ("tension", "tip_force", "tip_moment", "follower_force", "follower_line", "line_force", "node_force")
+
+
+def cold_start(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
+    """Fill x and the curvature guess of the robots `rows` from their inputs alone, and forget what was
+    learned before."""
+    if len(rows):  # a step asks every time, and hardly ever for anyone
+        begin(rows, layout, params, ports, memory)
+
+
+def unloaded(ports: Ports, layout: Layout, params: Params) -> Ports:
+    """The straight robot on the same base, without loads."""
+    ends = np.cumsum(params.length + ports.extension, axis=1)[:, layout.tendon_segment]
+    zeros: dict[str, Any] = {name: 0.0 * getattr(ports, name) for name in _LOADS}
+    return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
+
 
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""

@@ -12,9 +12,9 @@ from fastrod.contact.frames import blended
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import MotionShape
 from fastrod.rotation import displaced
-from fastrod.solver.guess import unloaded
 from fastrod.solver.modal import ModalSolver, Step
 from fastrod.solver.modal_response import full_newton
+from fastrod.solver.settle import unloaded
 from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 
 _JUMP = 2.0

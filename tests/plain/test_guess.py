@@ -16,8 +16,8 @@ from rods import bend, rod
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot, robot_names
 from fastrod.model.compile import compile_robots
 from fastrod.solver.boundary import BoundarySolver
-from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs, Reader
+from fastrod.solver.settle import cold_start
 from fastrod.types import Layout, Memory, Params, Ports
 
 N_STEPS = 6  # not a divisor of the guess's eight samples
