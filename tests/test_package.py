@@ -29,7 +29,7 @@ ALSO = {
     "parquet": "write_log(log, 'log.parquet'); assert len(read_log('log.parquet', "
     "fastrod.load_robot('prototype'))) == len(log)",
     "envs": "import gymnasium, fastrod_envs; assert gymnasium.spec('fastrod/Reach-v0').vector_entry_point",
-    "rl": "import torch, stable_baselines3; from fastrod_envs.policies import Policy, find; assert "
+    "rl": "import torch, stable_baselines3; from fastrod_envs.learning.policies import Policy, find; assert "
     "Policy(find('Reach', 'shipped'))",
     "viewer": "from fastrod_viewer.server import serve; server = serve(port=0); server.stop()",
     "device": "import can, canopen, cv2; from fastrod_device.hardware import load_hardware; assert "

@@ -70,7 +70,7 @@ ALLOWED: dict[str, str] = {
     "fastrod/identification/excite.py": "turn",
     # a file's method
     "device/fastrod_device/journal.py": "tell",
-    "gym_envs/fastrod_envs/arrays.py": "tell",
+    "gym_envs/fastrod_envs/learning/arrays.py": "tell",
     # names in reports, of options of environments and in policies that were trained
     "device/fastrod_device/bench/report.py": "cannot_be_told_from",
     "fastrod/identification/report/assemble.py": "cannot_be_told_from evidence",
@@ -79,7 +79,7 @@ ALLOWED: dict[str, str] = {
     "fastrod/identification/report/page.py": "evidence",
     "fastrod/identification/report/report.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/result.py": "cannot_be_told_from evidence",
-    "gym_envs/fastrod_envs/actor.py": "reach",
+    "gym_envs/fastrod_envs/learning/actor.py": "reach",
     "gym_envs/fastrod_envs/sb3.py": "reach",
     "gym_envs/fastrod_envs/tasks/pick_place.py": "Grip grip",
     "gym_envs/fastrod_envs/tasks/reach.py": "Reach ReachOptions ReachRewardOptions ReachTask",

@@ -253,8 +253,8 @@ def _envs(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace) -> int:
     _need("stable_baselines3", "train", "rl")
+    from fastrod_envs.learning.training import make_plan, read_config, resume, train
     from fastrod_envs.registration import name_of
-    from fastrod_envs.training import make_plan, read_config, resume, train
 
     out: Path | None = arguments.out
     if arguments.env is not None:
@@ -296,8 +296,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     _need("gymnasium", "evaluate", "envs")
     from rich.console import Console
 
-    from fastrod_envs import evaluation
-    from fastrod_envs.policies import Policy, find
+    from fastrod_envs.learning import evaluation
+    from fastrod_envs.learning.policies import Policy, find
     from fastrod_envs.registration import name_of
 
     options = _pairs(arguments.option, "--option")

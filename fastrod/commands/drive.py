@@ -134,8 +134,8 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
 def _policy(given: str, path: str, begins: float, robot: Robot, trust: bool) -> Law:
     """A policy of Track as a law; the path begins so many seconds into the plan."""
     try:
-        from fastrod_envs.policies import Policy, find
-        from fastrod_envs.policy_driver import PolicyDriver
+        from fastrod_envs.learning.policies import Policy, find
+        from fastrod_envs.learning.policy_driver import PolicyDriver
     except ImportError as error:
         raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
     driver = PolicyDriver(Policy(find("Track", given), trust=trust), path, robot)

@@ -35,7 +35,7 @@ class Rollouts:
     the file's text, so that the data set hangs on no file that may change."""
 
     def __post_init__(self) -> None:
-        from fastrod_envs.policies import find
+        from fastrod_envs.learning.policies import find
         from fastrod_envs.randomisation import Randomisation
         from fastrod_envs.registration import name_of, task_class
 
@@ -73,7 +73,7 @@ class Rollouts:
 
     def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
         """Every episode with one row more than steps: the last holds the final observation, and no action."""
-        from fastrod_envs.policies import Policy, find
+        from fastrod_envs.learning.policies import Policy, find
         from fastrod_envs.vector import BatchEnv
 
         rng = np.random.default_rng(seed)

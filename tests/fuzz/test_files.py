@@ -31,7 +31,7 @@ from fastrod.errors import FastrodError, InputError, LogError, RobotError, Unkno
 from fastrod.logs.runlog import read_log
 from fastrod.model.robotfile import load_robot
 from fastrod_device.hardware import SHIPPED, load_hardware
-from fastrod_envs.policies import Policy, find
+from fastrod_envs.learning.policies import Policy, find
 from fastrod_scenes.measured import read
 
 

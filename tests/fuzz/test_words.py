@@ -126,7 +126,7 @@ def test_a_bench_that_is_not_there_is_refused(rest: list[str], action: str) -> N
 )
 def test_an_environment_that_is_not_is_refused(command: str, env: str, rest: list[str]) -> None:
     if command == "evaluate":
-        from fastrod_envs import evaluation
+        from fastrod_envs.learning import evaluation
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(evaluation, "evaluate", begin)

@@ -18,8 +18,8 @@ import fastrod_envs
 from fastrod.errors import InputError, UnknownNameError
 from fastrod_envs import registration
 from fastrod_envs.describe import describe, summary
-from fastrod_envs.evaluation import evaluate
-from fastrod_envs.presets import Preset, preset_of
+from fastrod_envs.learning.evaluation import evaluate
+from fastrod_envs.learning.presets import Preset, preset_of
 from fastrod_envs.vector import BatchEnv
 
 AIM = '''"""Aim: point the tip of the prototype."""

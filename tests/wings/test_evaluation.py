@@ -17,7 +17,7 @@ from rich.console import Console
 from fastrod.commands.cli import main
 from fastrod.errors import InputError
 from fastrod_envs.describe import describe, summary
-from fastrod_envs.evaluation import Trial, correlation, evaluate, figures, table, write
+from fastrod_envs.learning.evaluation import Trial, correlation, evaluate, figures, table, write
 from fastrod_envs.registration import names
 from fastrod_envs.single import SingleEnv
 
@@ -100,7 +100,7 @@ def test_documentation_names_every_number() -> None:
 
 
 def test_a_policy_for_other_observations_is_refused() -> None:
-    from fastrod_envs.policies import Policy, find, shipped
+    from fastrod_envs.learning.policies import Policy, find, shipped
 
     if "Reach" not in shipped():
         pytest.skip("no policy of Reach is shipped")

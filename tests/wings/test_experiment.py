@@ -171,8 +171,8 @@ def test_a_stop_half_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) ->
 @pytest.mark.study
 def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
-    from fastrod_envs.policies import Policy, find
-    from fastrod_envs.policy_driver import PolicyDriver
+    from fastrod_envs.learning.policies import Policy, find
+    from fastrod_envs.learning.policy_driver import PolicyDriver
 
     made = circle_plan()
     model = tracking("circle", follow(bench.prototype, made, tmp_path / "model.csv"), made)

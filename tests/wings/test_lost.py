@@ -6,7 +6,7 @@ import pytest
 from environments import NAMES, needed
 
 import bench_lost
-from fastrod_envs.policies import Policy, find
+from fastrod_envs.learning.policies import Policy, find
 from fastrod_envs.registration import task_class
 from fastrod_envs.single import SingleEnv
 

@@ -10,8 +10,8 @@ pytest.importorskip(
 )
 
 from fastrod.commands.cli import main
-from fastrod_envs.presets import _SETTINGS, ALGORITHMS, settings_of
-from fastrod_envs.training import algorithm_class
+from fastrod_envs.learning.presets import _SETTINGS, ALGORITHMS, settings_of
+from fastrod_envs.learning.training import algorithm_class
 
 WRONG = [
     ("ppo", "lr=3", r"ppo has no setting 'lr'; did you mean 'learning_rate'\?"),

@@ -21,8 +21,8 @@ from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.solver.options import Observer
 from fastrod.types import Floats
-from fastrod_envs.policies import Policy, find
-from fastrod_envs.policy_driver import PolicyDriver
+from fastrod_envs.learning.policies import Policy, find
+from fastrod_envs.learning.policy_driver import PolicyDriver
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.tasks.track import APPROACH, DT, Track

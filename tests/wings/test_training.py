@@ -16,11 +16,10 @@ pytest.importorskip(
 from refusals import refusals
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError
-from fastrod_envs.arrays import read_arrays, write_arrays
-from fastrod_envs.imitation import imitate
-from fastrod_envs.policies import Policy, find, shipped
-from fastrod_envs.sb3 import BatchVecEnv
-from fastrod_envs.training import (
+from fastrod_envs.learning.arrays import read_arrays, write_arrays
+from fastrod_envs.learning.imitation import imitate
+from fastrod_envs.learning.policies import Policy, find, shipped
+from fastrod_envs.learning.training import (
     CHECKPOINT,
     CONFIG,
     POLICY,
@@ -31,6 +30,7 @@ from fastrod_envs.training import (
     resume,
     train,
 )
+from fastrod_envs.sb3 import BatchVecEnv
 from fastrod_envs.vector import BatchEnv
 
 SHORT = {"n_steps": 10, "n_epochs": 1}

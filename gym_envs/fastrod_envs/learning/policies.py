@@ -10,9 +10,9 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Floats
-from fastrod_envs.actor import Actor, actor_of, load_actor
+from fastrod_envs.learning.actor import Actor, actor_of, load_actor
+from fastrod_envs.learning.training import ACTOR, CONFIG, FOREIGN, TrainingPlan, load_foreign, read_config
 from fastrod_envs.registration import name_of
-from fastrod_envs.training import ACTOR, CONFIG, FOREIGN, TrainingPlan, load_foreign, read_config
 from fastrod_envs.vector import BatchEnv
 
 SHIPPED = "shipped"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fastrod.errors import InputError, shown
 from fastrod.types import Floats
-from fastrod_envs.arrays import read_arrays, write_arrays
+from fastrod_envs.learning.arrays import read_arrays, write_arrays
 
 Activation = Literal["tanh", "relu"]
 Singles = NDArray[np.float32]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod_envs.arrays import LARGEST, read_arrays, write_arrays
+from fastrod_envs.learning.arrays import LARGEST, read_arrays, write_arrays
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")

@@ -18,9 +18,9 @@ import msgspec
 from fastrod.checks import Bound, check
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.reading import reading
-from fastrod_envs.actor import actor_of
-from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
-from fastrod_envs.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
+from fastrod_envs.learning.actor import actor_of
+from fastrod_envs.learning.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
+from fastrod_envs.learning.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
@@ -190,7 +190,7 @@ def load_foreign(path: Path, algorithm: str, env: Any = None, *, trust: bool) ->
 def _run(plan: TrainingPlan, out: Path, progress: Progress | None, trust: bool = False) -> Path:
     import torch
 
-    from fastrod_envs.imitation import imitate
+    from fastrod_envs.learning.imitation import imitate
     from fastrod_envs.sb3 import BatchVecEnv
     from fastrod_envs.vector import BatchEnv
 

@@ -15,7 +15,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
-from fastrod_envs.policies import Policy
+from fastrod_envs.learning.policies import Policy
 from fastrod_envs.registration import name_of
 from fastrod_envs.surface import ReachableSurface
 from fastrod_envs.task import bounds
@@ -34,7 +34,7 @@ class PolicyDriver:
     is not measured (nan) is taken to be where it was last seen, for one step; after that the robot stays
     where it is until the tip is seen again.
 
-    >>> from fastrod_envs.policies import Policy, find
+    >>> from fastrod_envs.learning.policies import Policy, find
     >>> pilot = PolicyDriver(Policy(find("Track", "shipped")), "circle")
     >>> pilot.command([0.0, 0.0, 0.07], 0.0).shape
     (4,)

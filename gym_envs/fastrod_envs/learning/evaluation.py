@@ -13,7 +13,7 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
-from fastrod_envs.policies import Policy
+from fastrod_envs.learning.policies import Policy
 from fastrod_envs.registration import name_of, task_class
 from fastrod_envs.vector import BatchEnv
 
