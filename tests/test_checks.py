@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
-from test_words import PACKAGES, ROOT, sources
+from wheel import PACKAGES, ROOT, sources
 
 from fastrod.checks import Bound, Declared, check, check_number, declared_by
 from fastrod.errors import FastrodError, InputError

@@ -263,7 +263,7 @@ WRONG = {
     "track --emulate --robot prototyp": "no robot 'prototyp'; did you mean 'prototype'?",
     "track --emulate --robot tdcr_a": "there are 4 drives and robot 'tdcr_a' has 6 tendons.",
     "excite --emulate --camera 1": "--camera is for a real bench, not with --emulate",
-    "excite --emulate --eds none.eds": "the EDS file none.eds does not exist",
+    "excite --emulate --eds none.eds": "the EDS file none.eds cannot be read: No such file",
     "excite --bus can0": "--bus is 'can0'; give INTERFACE:CHANNEL, such as socketcan:can0.",
     "excite --bus socketcan:can0 --seed 1": "--seed is with --emulate only",
     "excite --bus socketcan:can0 --camera none": "--camera none is for teleop alone; excite needs a camera.",

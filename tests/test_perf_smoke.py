@@ -256,8 +256,9 @@ def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.
 
 
 def test_fcl_finds_the_same_distances() -> None:
+    from directscene import DirectScene
+
     import contact_batch
-    from fastrod.contact.direct import DirectScene
 
     batch, obstacle = contact_batch.make_batch(2), contact_batch.make_mesh(2)
     pose = contact_batch.places(batch, contact_batch.GRAZING)

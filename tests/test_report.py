@@ -32,7 +32,7 @@ from fastrod.identification.report.wording import (
     plain_name,
     with_error,
 )
-from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
 from fastrod.model.robotfile import load_robot
@@ -317,14 +317,14 @@ def test_numbers_are_said_in_friendly_units() -> None:
 
 
 BOUNDS = {
-    Bound("payload", "mass", "kg", 0.007): "payload: a mass above 7.0 g",
-    Bound("encoder_offset", "offset_1", "m", 1e-4): "encoder offset: an offset above 0.10 mm",
-    Bound("tip_force", "x", "N", 0.2): "tip force: a component along x above 0.20 N",
+    DetectionLimit("payload", "mass", "kg", 0.007): "payload: a mass above 7.0 g",
+    DetectionLimit("encoder_offset", "offset_1", "m", 1e-4): "encoder offset: an offset above 0.10 mm",
+    DetectionLimit("tip_force", "x", "N", 0.2): "tip force: a component along x above 0.20 N",
 }
 
 
 def test_bounds_are_sentences() -> None:
     for bound, words in BOUNDS.items():
         assert bound_sentence(bound) == f"{words} would have shown"
-    none = bound_sentence(Bound("axial_compression", "per_bend", "1/rad", NAN))
+    none = bound_sentence(DetectionLimit("axial_compression", "per_bend", "1/rad", NAN))
     assert none.startswith("this log cannot show axial compression")

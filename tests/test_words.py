@@ -12,11 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from wheel import PACKAGES, ROOT, sources
 
-ROOT = Path(__file__).parents[1]
-WINGS = ("device/fastrod_device", "gym_envs/fastrod_envs", "scenes/fastrod_scenes", "viewer/fastrod_viewer")
-PACKAGES = ("fastrod", *WINGS)
-"""The wheel."""
 GONE: dict[str, str] = {
     "wire wires wired": "tendon",
     "reach reaches": "length, tendon offset, limit or workspace",
@@ -87,12 +84,6 @@ ALLOWED: dict[str, str] = {
 }
 """Identifiers that stay, by file."""
 INSTEAD = {word: instead for words, instead in GONE.items() for word in words.split()}
-
-
-def sources(*paths: str) -> list[Path]:
-    """Python files at these files and below these folders."""
-    found = ([ROOT / path] if path.endswith(".py") else (ROOT / path).rglob("*.py") for path in paths)
-    return sorted(file for files in found for file in files)
 
 
 def identifiers(text: str) -> Iterator[tuple[int, str]]:

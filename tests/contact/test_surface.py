@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from contact.directscene import DirectScene
+from directscene import DirectScene
 from numba import njit
 from numpy.testing import assert_allclose
 

@@ -208,6 +208,7 @@ def test_a_log_that_was_let_go_begins_where_it_turns_back() -> None:
     assert let_go(creeps) is creeps
 
 
+@pytest.mark.study
 def test_replay_in_motion_is_the_simulator() -> None:
     """Step by step, with the robot's own effects and each run from rest."""
     plant = robot(effects=({"name": "friction", "half_width": 3e-4}, {"name": "marker_offset", "z": 5e-3}))

@@ -46,8 +46,9 @@ def test_figures_are_those_of_replay(demo: RunLog, robot: Robot) -> None:
     assert made.before.rms == pytest.approx(straight.rms, rel=1e-12)
 
 
+@pytest.mark.study(beyond=2)
 @pytest.mark.parametrize(
-    "robot", [ROBOT, with_(MEMORY), with_(MEMORY, LOAD), with_(CAMERA), with_(MEMORY, CAMERA)]
+    "robot", [ROBOT, with_(MEMORY, CAMERA), with_(MEMORY), with_(MEMORY, LOAD), with_(CAMERA)]
 )
 def test_the_drawn_tip_is_the_predicted_tip(demo: RunLog, robot: Robot) -> None:
     track = (made := Playback.of(demo, robot, frames=400)).before
