@@ -13,17 +13,20 @@ fastrod.errors.InputError: Lens.angle is 200 deg; it must be a number between 0 
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from math import inf
 from sys import float_info
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
-from fastrod.errors import InputError, nearest, shown
+from fastrod.errors import FastrodError, InputError, nearest, shown
+
+_Class = TypeVar("_Class")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +127,31 @@ def check_value(name: str, value: Any, declared: Declared) -> None:
         unit = f" {bound.unit}" if bound.unit else ""
         right = bound.right("a whole number" if kind is int else "a number")
         raise InputError(f"{name} is {shown(value)}{unit}; it must be {right}{none}.{hint}")
+
+
+def named_fields(error: type[FastrodError]) -> Callable[[type[_Class]], type[_Class]]:
+    """Decorate a dataclass: a field that it lacks, or that is missing, raises `error` with the nearest
+    name."""
+
+    def named(cls: type[_Class]) -> type[_Class]:
+        made, every = cls.__init__, fields(cls)  # type: ignore[arg-type]
+        known = [f.name for f in every]
+        needed = [f.name for f in every if f.default is MISSING and f.default_factory is MISSING]
+
+        @functools.wraps(made)
+        def checked(self: _Class, *args: Any, **given: Any) -> None:
+            for name in given:
+                if name not in known:
+                    raise error(f"{cls.__name__} has no field {name!r}; {nearest(name, known)}")
+            if missing := [name for name in needed if name not in given]:
+                raise error(f"{cls.__name__} lacks {', '.join(missing)}.")
+            made(self, *args, **given)
+
+        # mypy takes no assignment to a method
+        setattr(cls, "__init__", checked)  # noqa: B010
+        return cls
+
+    return named
 
 
 def declared_by(cls: type) -> Mapping[str, Declared]:

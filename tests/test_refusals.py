@@ -279,7 +279,10 @@ MOTION: Rows = [
         )
         for name, value in (("bending", 0), ("torsion", 9), ("strain", 1.5), ("pieces", "two"))
     ),
-    (lambda: Simulator(rod(), modes=Modes(4, 2)), "Simulator has no input 'modes'"),
+    (
+        lambda: Simulator(rod(), modes=Modes(4, 2)),
+        "no input 'modes'; it is one of the solver: solver=fastrod.Modal",
+    ),
     (
         lambda: moving(contact=scene()),
         "^contact was given with rods of modes, which feel none yet; take solver",
@@ -504,7 +507,11 @@ OTHERS: Rows = [
         "2 robots for n_robots 3; give one for all, or a list of n_robots",
     ),
     (lambda: touching().shape(np.zeros((3, 4, 5))), r"arclength has shape \(3, 4, 5\); it must be"),
-    (lambda: Observer(process_noise=0.0), "Observer.process_noise is 0.0; it must be positive and finite"),
+    (lambda: Observer(proces_noise=1.0), "no field 'proces_noise'; did you mean 'process_noise'"),
+    (
+        lambda: Observer(process_noise=0.0),
+        "Observer.process_noise is 0.0; it must be a number, positive and finite, or None",
+    ),
 ]
 
 REFUSED = [

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fastrod.checks import named_fields
 from fastrod.errors import RobotError, nearest, shown
 from fastrod.model.logformat import LogFormat
 
@@ -28,26 +28,6 @@ _STIFF = (1e-20, 1e15)  # N m^2
 _GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
 _MOST = 1e9
-
-
-def _named_fields(cls: type[_Class]) -> type[_Class]:
-    """The same dataclass; a field that it lacks, or that is missing, raises `RobotError` with the nearest
-    name."""
-    made, known = cls.__init__, [f.name for f in fields(cls)]  # type: ignore[arg-type]
-    needed = [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
-
-    @functools.wraps(made)
-    def checked(self: _Class, *args: Any, **given: Any) -> None:
-        for name in given:
-            if name not in known:
-                raise RobotError(f"{cls.__name__} has no field {name!r}; {nearest(name, known)}")
-        if missing := [name for name in needed if name not in given]:
-            raise RobotError(f"{cls.__name__} lacks {', '.join(missing)}.")
-        made(self, *args, **given)
-
-    # mypy takes no assignment to a method
-    setattr(cls, "__init__", checked)  # noqa: B010
-    return cls
 
 
 def _number(value: object) -> bool:
@@ -89,7 +69,7 @@ def _mean_power(ends: tuple[float, ...], power: int) -> float:
     return float((b ** (power + 1) - a ** (power + 1)) / ((power + 1) * (b - a)))
 
 
-@_named_fields
+@named_fields(RobotError)
 @dataclass(frozen=True, kw_only=True)
 class Tendon:
     """A tendon along the backbone, fixed at the end of its segment (the paper's pull wire).
@@ -143,7 +123,7 @@ class Tendon:
         return tuple((d * math.cos(b), d * math.sin(b)) for d, b in zip(offset, angle, strict=True))
 
 
-@_named_fields
+@named_fields(RobotError)
 @dataclass(frozen=True, kw_only=True)
 class Lump:
     """A rigid mass on the backbone: a disk, a marker, a payload."""
@@ -173,7 +153,7 @@ class Lump:
             )
 
 
-@_named_fields
+@named_fields(RobotError)
 @dataclass(frozen=True, kw_only=True)
 class Segment:
     """A length of backbone with one stiffness, and the tendons that end at its end."""
@@ -311,7 +291,7 @@ class Segment:
             )
 
 
-@_named_fields
+@named_fields(RobotError)
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """A chain of segments on a base, and the world it stands in.

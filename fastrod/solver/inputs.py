@@ -21,6 +21,15 @@ _R = TypeVar("_R")
 PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
 
 
+_ELSEWHERE = {
+    "dt": "the time step is given once: Simulator(robot, dt=...).",
+    **dict.fromkeys(("rho", "modes"), "it is one of the solver: solver=fastrod.Modal(...)."),
+    **dict.fromkeys(
+        ("observer", "kept_jacobian_tolerance", "process_noise", "measurement_noise"),
+        "it is one of the solver: solver=fastrod.Observer(...).",
+    ),
+}
+"""Inputs that belong elsewhere, and where."""
 _MOST = 1e12  # of any unit; products of a few such numbers still are floats
 
 
@@ -35,8 +44,7 @@ def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
         called = function.__name__ if function.__name__ != "__init__" else type(args[0]).__name__
         for name in inputs:
             if name not in known:
-                once = "the time step is given once: Simulator(robot, dt=...)."
-                why = once if name == "dt" else nearest(name, known)
+                why = _ELSEWHERE.get(name) or nearest(name, known)
                 raise InputError(f"{called} has no input {name!r}; {why}")
         if len(args) - 1 > positional:
             raise InputError(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 import numba
 import numpy as np
 
-from fastrod.checks import NOT_NEGATIVE, POSITIVE, Bound, check, check_number
+from fastrod.checks import NOT_NEGATIVE, POSITIVE, Bound, check, check_number, named_fields
 from fastrod.errors import InputError, RobotError, nearest, shown
 from fastrod.model.robot import Robot
 
@@ -32,6 +32,7 @@ class Modes(NamedTuple):
     pieces: int = 1
 
 
+@named_fields(InputError)
 @dataclass(frozen=True, kw_only=True)
 class Observer:
     """Solver of rods at rest that takes one forward integration a step: gains of the boundary observer (the
@@ -55,6 +56,7 @@ class Observer:
         check(self)
 
 
+@named_fields(InputError)
 @dataclass(frozen=True, kw_only=True)
 class Modal:
     """Solver of rods of curvature modes: for stretch and shear, and with `dynamics` in motion. Raises
