@@ -63,6 +63,7 @@ API = {
     "fastrod_scenes": "scenes",
 }
 """Packages whose public names the reference lists, and what they are for."""
+_FRAMES, _MOST_STEPS = 40, 160  # of a scene in motion
 LAWS = ("Effect", "Law", "Static", "Operator", "BodyOperator", "Parameter", "Seam", "Signal", "effect")
 """Names of `fastrod.effects.base` of which an own effect is made."""
 SECTIONS = {
@@ -372,6 +373,48 @@ def _pictured(name: str) -> bytes:
     return out.getvalue()
 
 
+def scenes() -> None:
+    """A page in motion of each scene, below their page: the beginning of its script, to rotate and zoom."""
+    from fastrod_scenes.scene import names
+    from fastrod_viewer.drive.session import ViewFrame
+    from fastrod_viewer.export import wrap
+    from fastrod_viewer.page import PageView, plain, stand_back
+    from fastrod_viewer.picture.canvas import Canvas
+    from fastrod_viewer.picture.drawing import Drawing
+    from fastrod_viewer.picture.options import ViewOptions
+    from fastrod_viewer.server import serve
+    from fastrod_viewer.worlds.catalogue import open_world
+
+    served, text = serve(port=0), ["\n\n## Every scene in motion\n"]
+    for name in names():
+        world, canvas = open_world(name), Canvas(served.viser)
+        drawing = Drawing(canvas, world, ViewOptions(body="skin"))
+        stand_back(served.viser, PageView(drawing.middle, drawing.size))
+        film = served.viser.get_scene_serializer()
+        each = max(1, min(_MOST_STEPS, round(world.duration / world.dt)) // _FRAMES)
+        for _ in range(_FRAMES):
+            for _ in range(each):
+                world.play()
+            drawing.draw(ViewFrame(world, None, None, float("nan"), 1.0, ""))
+            film.insert_sleep(each * world.dt)
+        page = wrap(
+            film.as_html(),
+            title=plain(name),
+            subtitle=world.about,
+            legend_html=drawing.legend,
+            plot_svg=None,
+            facts=[("shown", f"{_FRAMES * each * world.dt:.1f} s of {world.duration:.1f} s")],
+            note="Drag to rotate, scroll to zoom.",
+        )
+        write(f"films/{name}.html", page)
+        text.append(f"- [{plain(name)}](films/{name}.html). {world.about}")
+        canvas.clear()
+        world.close()
+    served.stop()
+    with mkdocs_gen_files.open("scenes.md", "a") as file:
+        file.write("\n".join(text) + "\n")
+
+
 def api() -> None:
     """Every public name."""
     text = ["# API", "Names are imported from the package that heads their section."]
@@ -440,5 +483,5 @@ def citation() -> None:
 
 for source, place in PAGES.items():
     copied(source, place)
-for make in (robot_file, run_log, effects, commands, environments, api, errors, citation):
+for make in (robot_file, run_log, effects, commands, environments, scenes, api, errors, citation):
     make()
