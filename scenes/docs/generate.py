@@ -63,7 +63,7 @@ API = {
     "fastrod_scenes": "scenes",
 }
 """Packages whose public names the reference lists, and what they are for."""
-_FRAMES, _MOST_STEPS = 40, 160  # of a scene in motion
+_FRAMES, _MOST_STEPS = 32, 96  # of a scene in motion
 LAWS = ("Effect", "Law", "Static", "Operator", "BodyOperator", "Parameter", "Seam", "Signal", "effect")
 """Names of `fastrod.effects.base` of which an own effect is made."""
 SECTIONS = {
