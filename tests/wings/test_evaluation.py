@@ -75,6 +75,7 @@ def test_table_and_files(tmp_path: Path) -> None:
     assert paths[1].read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.study
 def test_the_command_lists_describes_and_evaluates(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["envs"]) == 0
     listed = capsys.readouterr().out

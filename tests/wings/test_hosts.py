@@ -17,6 +17,7 @@ from fastrod.simulator import Simulator
 MOUNT = {"position": (0.02, 0.01, 0.05), "quaternion": (0.5, 0.5, -0.5, 0.5)}
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     # M dq'/dt with the rod, less that without it, is J^T F; PyBullet keeps poses in single precision, so 1e-7

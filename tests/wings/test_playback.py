@@ -36,6 +36,7 @@ def with_(*effects: dict[str, object]) -> Robot:
     return replace(ROBOT, effects=effects)
 
 
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize("robot", [ROBOT, with_(MEMORY, LOAD)], ids=["bare", "effects"])
 def test_figures_are_those_of_replay(demo: RunLog, robot: Robot) -> None:
     made, straight = Playback.of(demo, robot), replay(demo, robot)
