@@ -46,9 +46,10 @@ def row(name: str, result: Result) -> Found:
 
 def trunk() -> list[Found]:
     """0 g: fitted on 90 s, held out 60 s, moved by commands and by what its drives did of them. 100 g: the
-    same robot with that mass, nothing fitted; then both fitted together. Two other sessions: zeros,
-    registration and delay alone. Strokes and steps by themselves. The base model alone;
-    then a search, and one from a file that has six push-pull tendons on a body that cannot shorten."""
+    same robot with that mass, nothing fitted; then both fitted together. Other sessions: zeros, tightness,
+    registration and delay alone, and where the mass hangs. Strokes and steps by themselves. The base model
+    alone; then a search, and one from a file that has six push-pull tendons on a body that cannot
+    shorten."""
     given, robot = asl_trunk(DATA / "asl_trunk.csv")
     given = replace(given, points=None)  # the tip is what is judged, so the tip alone is fitted
     log = replace(given, pos=None)
@@ -60,9 +61,13 @@ def trunk() -> list[Found]:
     found[-1][1].append(f"  from the measured state: {segments(moved)}")
     others, _ = asl_trunk(DATA / "asl_trunk_sessions.csv")
     others = replace(others, points=None, pos=None)
-    for run in ("perlin_2_a", "hops_june_a"):
-        fitted = identify(others.only(run), light.identified, only_session=True)
-        found.append(row(f"trunk, {run}", fitted))
+    for all_runs, run, tested in (
+        (others, "perlin_2_a", []),
+        (others, "hops_june_a", []),
+        (log, "perlin_100g", ["perlin_100g@90:"]),
+    ):
+        fitted = identify(all_runs.only(run), light.identified, only_session=True, held_out=tested)
+        found.append(row(f"trunk, {run} as another session", fitted))
     runs = ("perlin_0g", "perlin_100g")
     both = identify(log.only(*runs), robot, held_out=[f"{run}@90:" for run in runs], max_effects=0)
     each = [f"{run} {tip_rms(log.only(run), both.identified, 90.0, 1e9):.2f} mm" for run in runs]

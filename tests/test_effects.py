@@ -143,7 +143,11 @@ def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: 
     base, seen = (run(simulator(r), lengths) for r in (robot, having(robot, at_typical(name, robot))))
     moved = np.abs(seen["measured tip_position"] - base["measured tip_position"]).max((0, 2))
     assert np.isfinite(seen["measured tip_position"]).all()
-    if robot.n_segments < trait(get_effect(name), "least_segments"):
+    if name == "load_offset":  # the first robot bears no load
+        assert moved[0] == 0.0
+        moved = moved[1:]
+    two_sided = name == "tightening"  # of tendons that can push nothing shows
+    if two_sided or robot.n_segments < trait(get_effect(name), "least_segments"):
         assert (moved == 0.0).all()
     else:
         # a camera sees a tenth of a millimetre, a short run shows only a part of a slow effect

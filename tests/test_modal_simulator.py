@@ -247,6 +247,23 @@ def test_effects_of_slow_motion_are_those_of_the_rod_at_rest(name: str) -> None:
     assert moving < 0.02 * effect
 
 
+def test_tighter_tendons_shorten_a_body_by_their_own_springs() -> None:
+    """Tension n T over EA / l shortens it, and each tendon's compliance c takes the rest of T0 (1 + f)."""
+    EA, T0, c, f = 400.0, 3.0, 1e-3, 0.5
+    robot = rod(axial_stiffness=EA)
+    (segment,) = robot.segments
+    tendons = tuple(replace(t, unilateral=True, pretension=T0, compliance=c) for t in segment.tendons)
+    robot = replace(robot, segments=(replace(segment, tendons=tendons),))
+    n, length = len(tendons), segment.length
+    for fraction in (0.0, f):
+        state = Simulator(having(robot, {"name": "tightening", "fraction": fraction})).settle(
+            robot.rest_tendon_length
+        )
+        tension = T0 * (1.0 + fraction) / (1.0 + n * length / (EA * c))
+        assert_allclose(state.tension[0], tension, rtol=1e-6)
+        assert_allclose(length - state.tip_position[0, 2], n * tension * length / EA, rtol=1e-6)
+
+
 @BOTH
 def test_shape_jacobian_and_compliance_are_those_of_the_observer(options: dict[str, Any]) -> None:
     fine = Modal(dynamics=options == MOVING, modes=Modes(6, 4))

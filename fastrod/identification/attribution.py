@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from fastrod.effects.base import effect_names, get_effect
 from fastrod.effects.executor import acts_on_commands, feels_tip
 from fastrod.effects.pipeline import named_effects
@@ -106,7 +108,7 @@ def identify(
     given = [logs] if isinstance(logs, (RunLog, str, Path)) or not isinstance(logs, Sequence) else logs
     every = [log_of(one, robot) for one in given]
     log = split(every, robot, held_out)
-    excluded = frozenset(exclude) | _not_of(robot, log.samples.log.without_tip)
+    excluded = frozenset(exclude) | _not_of(robot, log.samples.log, dynamics)
     # refuses a wrong [fit] before anything is solved
     model = base_model(
         robot,
@@ -136,6 +138,7 @@ def identify(
             margin=MARGIN if clock else 0.0,
             sessions=log.samples.sessions,
             only_session=only_session,
+            loaded=_is_loaded(log.samples.log),
         )
 
     progressed("base fit", 0, most)
@@ -164,12 +167,18 @@ def identify(
     )
 
 
-def _not_of(robot: Robot, without_tip: bool) -> frozenset[str]:
-    """Effects that are none of such a robot: of tendon lengths where forces drive the tendons, and of a tip
-    that was not measured."""
-    lengths = {name for name in effect_names() if not acts_on_commands(get_effect(name), route(robot))}
-    tip = {"marker_offset", *(name for name in effect_names() if feels_tip(get_effect(name)))}
-    return frozenset(lengths | (tip if without_tip else set()))
+def _not_of(robot: Robot, log: RunLog, dynamics: bool) -> frozenset[str]:
+    """Effects that are none of such a robot: of tendon lengths where forces drive the tendons, of a tip that
+    was not measured, and of a load that no log names, or that is a mass in motion."""
+    names = {name for name in effect_names() if not acts_on_commands(get_effect(name), route(robot))}
+    if log.without_tip:
+        names |= {"marker_offset", *(name for name in effect_names() if feels_tip(get_effect(name)))}
+    return frozenset(names if _is_loaded(log) and not dynamics else names | {"load_offset"})
+
+
+def _is_loaded(log: RunLog) -> bool:
+    """Whether a log names a load at the tip."""
+    return any(load is not None and bool(np.nan_to_num(load).any()) for load in (log.payload, log.tip_force))
 
 
 def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:

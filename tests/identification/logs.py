@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rods import rod
 
-from fastrod import Robot
+from fastrod import Robot, Tendon
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.logs.runlog import RunLog
@@ -18,6 +18,17 @@ from fastrod.model.routing import route
 def one_segment(line_density: float = 0.0, **changes: Any) -> Robot:
     robot = rod(line_density=line_density, extension=(-0.01, 0.01))
     return replace(robot, name="one", log_points=(0.03,), **changes)
+
+
+def one_sided() -> Robot:
+    """Four elastic tendons that can only pull, two on a drive, on a body that shortens."""
+    (segment,) = one_segment().segments
+    tendons = tuple(
+        Tendon(offset=0.006, angle=np.pi / 2.0 * k, compliance=6e-4, pretension=0.6, unilateral=True)
+        for k in range(4)
+    )
+    whole = replace(segment, tendons=tendons, extension=(0.0, 0.0), axial_stiffness=80.0)
+    return replace(one_segment(), segments=(whole,), log_points=())
 
 
 def two_segments(line_density: float = 0.0, **changes: Any) -> Robot:

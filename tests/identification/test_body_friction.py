@@ -8,10 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from identification.logs import log_of, one_segment
+from identification.logs import log_of, one_sided
 from scipy.spatial.transform import Rotation
 
-from fastrod import Robot, Tendon
 from fastrod.effects.executor import link, stay_back
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
@@ -23,17 +22,6 @@ NOISE, N = 1e-4, 400
 TRUE = {"bend": 0.06, "width": 0.05}
 
 
-def robot() -> Robot:
-    """Four elastic tendons that can only pull, two on a drive, on a body that shortens."""
-    (segment,) = one_segment().segments
-    tendons = tuple(
-        Tendon(offset=0.006, angle=math.pi / 2.0 * k, compliance=6e-4, pretension=0.6, unilateral=True)
-        for k in range(4)
-    )
-    whole = replace(segment, tendons=tendons, extension=(0.0, 0.0), axial_stiffness=80.0)
-    return replace(one_segment(), segments=(whole,), log_points=())
-
-
 @cache
 def found() -> Result:
     """Return what identify says where the body rubs: swings of many sizes, with holds."""
@@ -41,13 +29,13 @@ def found() -> Result:
     size = 0.55 + 0.45 * np.cos(0.23 * t)
     held = np.where((t > 12.0) & (t < 15.0), 12.0, t)
     bend = size[:, None] * np.stack([np.sin(0.9 * held), 0.7 * np.sin(0.53 * held + 1.0)], axis=1)
-    rubs = replace(robot(), effects=({"name": "body_friction"} | TRUE,))
+    rubs = replace(one_sided(), effects=({"name": "body_friction"} | TRUE,))
     log = log_of(rubs, route(rubs).tendon_change(bend[:, None]), 0.1)
     model, samples = base_model(rubs), sample(log)
     pose = predict(model, model.start, samples, PredictedRod(samples, rubs))
     assert pose.ok.all()
     noise = NOISE * np.random.default_rng(0).normal(size=(N, 3))
-    return identify(replace(log, tip_position=pose.position + noise), robot())
+    return identify(replace(log, tip_position=pose.position + noise), one_sided())
 
 
 @pytest.mark.study
@@ -65,7 +53,7 @@ def test_friction_of_the_body_is_named_with_its_numbers() -> None:
 
 @pytest.mark.parametrize("angle", [0.3, 1.1, 2.5])
 def test_what_stays_back_has_no_favourite_direction(angle: float) -> None:
-    wiring = route(robot())
+    wiring = route(one_sided())
     path = np.random.default_rng(3).normal(size=(60, 1, 2)).cumsum(0) * 0.03
     turned = path @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()[:2, :2].T
     values = np.array([[TRUE["bend"], TRUE["width"], 0.8]])

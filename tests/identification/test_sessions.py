@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from identification.logs import displacement_of, log_of, one_segment, wave
+from identification.logs import displacement_of, log_of, one_segment, one_sided, wave
 
 from fastrod.commands.cli import main
 from fastrod.errors import LogError
@@ -136,6 +136,23 @@ def test_rows_without_a_position_are_not_driven_and_a_run_without_any_goes_by_it
     assert len(samples.log) == N - 1
     assert np.array_equal(samples.log.dl[-N // 2 :], log.dl[N // 2 :])
     assert np.abs(samples.log.dl[:50]).max() < 0.6 * np.abs(log.dl[:50]).max()
+
+
+@pytest.mark.study
+def test_another_day_has_tighter_tendons_and_its_load_hangs_elsewhere() -> None:
+    robot = one_sided()
+    moved = wave(robot, N, DT, size=0.9, seed=5)
+    tighter, beside = {"name": "tightening", "fraction": 0.4}, {"name": "load_offset", "x": 6e-3, "y": -4e-3}
+    log = log_of(robot, moved, DT, payload=np.full(N, 0.02))
+    tip = replay(log, replace(robot, effects=(tighter, beside))).tip_position
+    log = replace(log, tip_position=tip + NOISE * np.random.default_rng(5).normal(size=(N, 3)))
+    result = identify(log, robot, only_session=True, held_out=["@9:"])
+    assert result.test.after < 1.1 * np.sqrt(3.0) * NOISE < 0.2 * result.as_given_rms[1]  # type: ignore[index]
+    for table in (tighter, beside):
+        for key in table.keys() - {"name"}:
+            found = result.base_parameters[f"{table['name']}.{key}"]
+            assert found.value == pytest.approx(table[key], abs=4.0 * found.stderr)
+    assert result.base_parameters["tightening.fraction"].stderr < 0.05
 
 
 @pytest.mark.study

@@ -245,6 +245,18 @@ def test_a_body_gets_longer_with_the_square_of_its_bend() -> None:
         assert_allclose(length, segment.length + a * turned**2, rtol=0, atol=1e-9)
 
 
+def test_a_load_beside_the_axis_bends_a_rod_that_it_pulls() -> None:
+    """Beam under tension F with the end moment F o: the tip moves by o (1 - 1/cosh(l sqrt(F / EI)))."""
+    bare, o, force = rod("passive"), 1e-5, 0.7
+    (segment,) = bare.segments
+    wave_number = np.sqrt(force / np.array(segment.bending_stiffness))
+    expected = -o * (1.0 - 1.0 / np.cosh(wave_number * segment.length))
+    for axis in (0, 1):
+        sim = Simulator(replace(bare, effects=({"name": "load_offset", "xyz"[axis]: o},)))
+        state = sim.settle(tip_force=(0.0, 0.0, force), tolerance=1e-11 * bare.length)
+        assert_allclose(state.tip_position[0, axis], expected[1 - axis], rtol=1e-3)
+
+
 def test_relaxation_after_a_step() -> None:
     # c (1 - exp(-t / tau)) of it comes late: out = 1 - c exp(-t / tau); the step takes no time
     dt = np.concatenate([[0.1, 0.0], np.random.default_rng(5).uniform(0.001, 2.0, 40)])

@@ -43,6 +43,10 @@ FREE_CAMERA: dict[str, Any] = {"registration_sd": (0.01, 0.05), "marker_offset_s
 """Priors of a camera that nobody calibrated: m and rad, m, s."""
 _ZERO_SD = 0.1
 """Prior of a drive's zero in another session, where `[fit]` says nothing: rad, as a bend of its segment."""
+_TIGHTER_SD = 0.5
+"""Prior of a session's pretension, relative."""
+_HANGS_SD = 0.05
+"""Prior of where a session's load hangs, per axis, robot lengths."""
 ROUGH = (0.1, 0.2)
 """Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm
 off."""
@@ -56,10 +60,12 @@ def base_model(
     dynamics: bool = False,
     sessions: Sequence[str] = ("",),
     only_session: bool = False,
+    loaded: bool = False,
     margin: float = 0.0,
 ) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness; and of each
-    of its `sessions` but the first, its own zeros, registration and delay.
+    of its `sessions` but the first, its own zeros, pretension, registration and delay, and where a tip that
+    is `loaded` bears its load.
 
     `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. The commands
     were laid `margin` [s] too early, where that is not 0: about that is the delay, which is fitted.
@@ -108,11 +114,11 @@ def base_model(
         for u in _camera(sensor, robot, wiring)
     ]
     if only_session:
-        unknowns = _of_session(robot, wiring, sensor)
+        unknowns = _of_session(robot, wiring, sensor, loaded)
     for k, label in enumerate(sessions[1:], 1):
         unknowns += [
             replace(u, name=f"session {label or k + 1}.{u.name}", session=k)
-            for u in _of_session(robot, wiring, sensor)
+            for u in _of_session(robot, wiring, sensor, loaded)
         ]
     effects += [u.place[1] for u in unknowns if u.place[0] == "effect"]
     return Model(
@@ -200,9 +206,9 @@ def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, flo
     return made
 
 
-def _of_session(robot: Robot, wiring: Routing, sensor: Mapping[str, Any]) -> list[Unknown]:
-    """Return what another session has of its own: zeros of the drives, registration and delay, about what
-    the robot file says."""
+def _of_session(robot: Robot, wiring: Routing, sensor: Mapping[str, Any], loaded: bool) -> list[Unknown]:
+    """Return what another session has of its own: zeros of the drives, how tight tendons are that can only
+    pull, registration and delay, and where the load hangs, about what the robot file says."""
     zero = float(
         robot.fit.get("tendon.*.zero", {}).get("sd", _ZERO_SD * float(np.mean(wiring.tendon_offset)))
     )
@@ -210,9 +216,12 @@ def _of_session(robot: Robot, wiring: Routing, sensor: Mapping[str, Any]) -> lis
     delay = max(float(sensor.get("latency_sd", 0.0)), FREE_CAMERA["latency_sd"])
     every = list(range(robot.n_tendons))
     zeros = _drive_unknowns(robot, wiring, "zero", every, zero, False, "tendon.*.zero") if every else []
+    tight = any(t.unilateral and t.pretension * t.compliance > 0.0 for t in robot.tendons)
     return [
         *zeros,
+        *(_about(robot, wiring, "tightening", ["fraction"], _TIGHTER_SD) if tight else []),
         *_camera({"registration_sd": (shift, angle), "latency_sd": delay if every else 0.0}, robot, wiring),
+        *(_about(robot, wiring, "load_offset", list("xyz"), _HANGS_SD * robot.length) if loaded else []),
     ]
 
 
@@ -285,27 +294,31 @@ def _wider(given: Any, least: tuple[float, float]) -> tuple[float, float]:
 
 def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Routing) -> list[Unknown]:
     """The camera's unknowns, about where the effects of the robot file have it."""
-    made: list[Unknown] = []
-    known = named_effects(robot)
     shift, angle = _pair(sensor.get("registration_sd", 0.0))
-    for names, sd, effect_name in (
-        ([f"rotation_{a}" for a in "xyz"], angle, "frame_misalignment"),
-        ([f"shift_{a}" for a in "xyz"], shift, "frame_misalignment"),
-        (["x", "y", "z"], float(sensor.get("marker_offset_sd", 0.0)), "marker_offset"),
-        (["delay"], float(sensor.get("latency_sd", 0.0)), "latency"),
-    ):
-        every = columns(get_effect(effect_name), wiring)
-        unit = next(p.unit for p in get_effect(effect_name).parameters if p.name == names[0])
-        table = known.get(effect_name, {})
-        for label in names if sd > 0.0 else []:
-            mean = float(table.get(label, 0.0))
-            low, start = mean - 10.0 * sd, mean
-            if effect_name == "latency":
-                low, start = 0.0, mean or min(0.5 * sd, 0.05)
-            place = ("effect", effect_name, str(every.index(label)))
-            made.append(
-                Unknown(
-                    f"{effect_name}.{label}", unit, start, mean, sd, (low, mean + 10.0 * sd), 0.1 * sd, place
-                )
-            )
+    return [
+        unknown
+        for name, labels, sd in (
+            ("frame_misalignment", [f"rotation_{a}" for a in "xyz"], angle),
+            ("frame_misalignment", [f"shift_{a}" for a in "xyz"], shift),
+            ("marker_offset", list("xyz"), float(sensor.get("marker_offset_sd", 0.0))),
+            ("latency", ["delay"], float(sensor.get("latency_sd", 0.0))),
+        )
+        for unknown in (_about(robot, wiring, name, labels, sd) if sd > 0.0 else [])
+    ]
+
+
+def _about(robot: Robot, wiring: Routing, name: str, labels: list[str], sd: float) -> list[Unknown]:
+    """Parameters of an effect that exists once per robot, about what the robot file says of them."""
+    every, own = columns(get_effect(name), wiring), named_effects(robot).get(name, {})
+    parameters = {p.name: p.on(wiring) for p in get_effect(name).parameters}
+    made: list[Unknown] = []
+    for label in labels:
+        mean = float(own.get(label, 0.0))
+        low, high, start = mean - 10.0 * sd, mean + 10.0 * sd, mean
+        if name == "latency":
+            low, start = 0.0, mean or min(0.5 * sd, 0.05)
+        low = max(low, parameters[label].bounds[0])
+        place = ("effect", name, str(every.index(label)))
+        unit = parameters[label].unit
+        made.append(Unknown(f"{name}.{label}", unit, start, mean, sd, (low, high), 0.1 * sd, place))
     return made
