@@ -75,7 +75,7 @@ class Simulator(RobotBatch):
 
         `contact` is what the rods may touch; without it they pass through everything. Without `feel_contact`
         they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone.
-        Rods of modes feel none yet.
+        Rods of modes feel it in motion, at obstacles whose motion is given.
 
         `threads` defaults to numba's. With `device="cuda"` the observer's passes run on an NVIDIA GPU, one
         thread a robot, from the same source: numbers agree to rounding. The memory of the observer stays
@@ -110,7 +110,12 @@ class Simulator(RobotBatch):
         if isinstance(how, Modal):
             from fastrod.solver.motion import ModalRods
 
-            return ModalRods(how, self.robots, self._layout, self._plain, self.n_robots, **shared)
+            robots = how, self.robots, self._layout, self._plain, self.n_robots
+            if self._felt is None:
+                return ModalRods(*robots, **shared)
+            from fastrod.solver.touching import TouchingRods
+
+            return TouchingRods(self._felt, *robots, **shared)
         shared |= {"device": self.device, "recover": bool(recover)}
         given = how, self._layout, self._plain, self.n_robots
         if self._felt is None:

@@ -256,6 +256,20 @@ class ModalSolver:
         self._run(rows, ports, shape, moving, how, jump, (_NEARLY, how.passes, _MOST), how.scheme)
         return np.asarray(self.iterations[rows] > 0)
 
+    def hold(
+        self,
+        rows: Ints,
+        ports: Ports,
+        shape: RodShape,
+        moving: MotionShape,
+        how: Step,
+        unknowns: Floats,
+        ends: bool,
+    ) -> None:
+        """Show these robots at `unknowns` (n_robots, n_q) a step further; where it `ends` there, they go on
+        from it."""
+        self._run(rows, ports, shape, moving, how, None, (_NEARLY, 1, 1), how.scheme, unknowns, ends)
+
     def _run(
         self,
         rows: Ints,
@@ -266,6 +280,8 @@ class ModalSolver:
         jump: Floats | None,
         effort: tuple[float, int, int],
         remembers: int,
+        given: Floats | None = None,
+        ends: bool = True,
     ) -> None:
         chunks = -(-len(rows) // LANES)
         tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
@@ -275,7 +291,7 @@ class ModalSolver:
 
         def run_some(task: int) -> None:
             some = rows[task * each : (task + 1) * each]
-            run = self._run_of(some, how, jump, effort, remembers)
+            run = self._run_of(some, how, jump, effort, remembers, given, ends)
             pass_modes(run, batch, output, ModalWork(*(room[task : task + 1] for room in work)))
 
         if tasks == 1:
@@ -321,7 +337,14 @@ class ModalSolver:
         return ModalBatch(self.params, ports, self.layout, self.pieces, self.points, self.basis, motion, host)
 
     def _run_of(
-        self, rows: Ints, how: Step, jump: Floats | None, effort: tuple[float, int, int], remembers: int
+        self,
+        rows: Ints,
+        how: Step,
+        jump: Floats | None,
+        effort: tuple[float, int, int],
+        remembers: int,
+        given: Floats | None = None,
+        ends: bool = True,
     ) -> ModalRun:
         return ModalRun(
             rows,
@@ -334,6 +357,8 @@ class ModalSolver:
             float(how.rho),
             *effort,
             remembers,
+            self.motion.q[:0] if given is None else given,
+            ends,
         )
 
     def derive(
@@ -347,13 +372,14 @@ class ModalSolver:
     ) -> ModalDerivatives:
         """Derivatives of these robots at their unknowns or at `unknowns` (n_robots, n_q), zeros for the
         others: at rest, or in a `step` from a motion with its `jump` (`step`). `wanted` names the matrices:
-        hessian, mass (at rest), damping (in a step), number for the last three, which come along with
-        the hessian under a line force that follows the rod."""
+        hessian, mass (at rest), damping (in a step), number for what has inertia, which comes along
+        with the hessian under a line force that follows the rod, point for the point forces."""
         n, motion = self.n_robots, self.motion if step is None else step[0]
         q = motion.q if unknowns is None else unknowns
         n_q, m = q.shape[1], motion.place.shape[1]
         followed = len(ports.follower_line) > 0 and "hessian" in wanted
         n_nodes = len(self.pieces.segment) * len(self.basis.node) if followed else 0
+        n_points = self.points.piece.shape[1]
         shapes = {
             "gradient": (n_q,),
             "hessian": (n_q, n_q),
@@ -367,11 +393,15 @@ class ModalSolver:
             "number": (m,),
             "number_change": (m, n_q),
             "inertia": (m,),
+            "point": (n_points, 3),
+            "point_change": (n_points, 3, n_q),
         }
-        left_out = {"hessian", "mass", "damping", "number"} - set(wanted)
+        left_out = {"hessian", "mass", "damping", "number", "point"} - set(wanted)
         left_out -= {"number"} if followed else set()
         if "number" in left_out:
             left_out |= {"number_change", "inertia"}
+        if "point" in left_out:
+            left_out |= {"point_change"}
         found = ModalDerivatives(
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )

@@ -164,7 +164,7 @@ def solver_of(
     return modal if dynamics or soft or solver == "modal" else own or Observer()
 
 
-def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool, device: str) -> None:
+def check_fellows(solver: Observer | Modal, contact: Any, feel_contact: bool, device: str) -> None:
     """Raise `InputError` for a contact scene that is none, and for options that do not go together."""
     felt = contact is not None and feel_contact
     if contact is not None:
@@ -175,10 +175,15 @@ def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool,
                 f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
             )
     if isinstance(solver, Modal):
-        if felt:
+        if felt and not solver.dynamics:
             raise InputError(
-                "contact was given with rods of modes, which feel none yet; take solver='observer', or "
-                "feel_contact=False."
+                "contact was given with rods of modes at rest, which feel none; take dynamics=True, "
+                "solver='observer', or feel_contact=False."
+            )
+        if felt and (contact.self_contact or contact.worlds is not None):
+            raise InputError(
+                "contact was given with rods in motion, which feel obstacles whose motion is given and no "
+                "more yet; leave out self_contact, worlds and free bodies."
             )
         if device == "cuda":
             raise InputError("device was given with rods of modes, which do not take it; leave it out.")

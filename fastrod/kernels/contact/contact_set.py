@@ -38,6 +38,8 @@ class ContactRules(NamedTuple):
     """Violation that counts as none [m]."""
     keep: float
     """Gap below which an idle contact is kept [m]."""
+    still: bool
+    """Contacts stay where they are, and none is dropped: more come where the gap is violated."""
 
 
 @inline
@@ -77,6 +79,7 @@ def open_contact(
     set_normal(contact, n)
     contact.arm, contact.shift, contact.damped_stiffness = radius if friction > 0.0 else 0.0, FAR, 0.0
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
+    contact.held[0], contact.held[1], contact.held[2], contact.slid = 0.0, 0.0, 0.0, 0.0
     contact.matched = False
 
 
@@ -208,7 +211,7 @@ def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
     for c in range(count):
         contact = contacts[c]
         idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
-        if carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
+        if rules.still or carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
             if n != c:
                 contacts[n] = contacts[c]
             contacts[n].matched = False
@@ -239,8 +242,9 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
 def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
-    if candidate.gap >= contact.gap - (_SAME_GAP if contact.arm > 0.0 else 0.0):
-        return True
+    near = rules.tolerance if rules.still else _SAME_GAP if contact.arm > 0.0 else 0.0
+    if candidate.gap >= contact.gap - near or rules.still:
+        return candidate.gap >= contact.gap - near
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
     if settles or not carries(contact) or contact.arm > 0.0:
@@ -387,6 +391,7 @@ def merge(count: int, contacts: Records, spacing: float) -> int:
         if into >= 0:
             for a in range(3):
                 contacts[into].force[a] += contact.force[a]
+                contacts[into].held[a] += contact.held[a]
             continue
         if n != c:
             contacts[n] = contacts[c]

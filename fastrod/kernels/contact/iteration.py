@@ -239,15 +239,27 @@ def _take_step(fraction: float, world: ContactWorld, problem: ContactProblem, x:
 
 
 @kernel
-def _renew_contacts(r: int, world: ContactWorld, problem: ContactProblem, stack: Numbers) -> None:
-    """The contacts of row r for its next pass."""
-    i, o, rods, surfaces, motion = world.robot[r], r - world.first, world.rods, world.surfaces, world.motion
-    contacts, frames, curve = (
-        world.contacts.contact[i],
+def renew_contacts(
+    i: int,
+    n_found: int,
+    found: Records,
+    rods: ContactRods,
+    surfaces: Surfaces,
+    motion: ContactMotion,
+    contacts: ContactSet,
+    room: tuple[Floats, Records],
+    still: bool,
+    stack: Numbers,
+) -> None:
+    """The contacts of robot i for its next pass, from its candidates (`ContactRules.still`). `room` is for the centreline at each
+    contact (max_contacts, 3) and the walls of a corner."""
+    contact, frames, curve = (
+        contacts.contact[i],
         motion.frames[pick(i, len(motion.frames))],
         curve_of(motion, i),
     )
-    n_found, found, margin = problem.n_found[o], problem.found[o], motion.margin * rods.length[i]
+    centre, wall = room
+    margin = motion.margin * rods.length[i]
     face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)
     rules = ContactRules(
         surfaces,
@@ -258,15 +270,14 @@ def _renew_contacts(r: int, world: ContactWorld, problem: ContactProblem, stack:
         rods.spacing[i],
         motion.tolerance,
         _KEPT * margin,
+        still,
     )
-    count = choose(n_found, found, world.contacts.used[i], contacts, rules)
-    count = merge(count, contacts, rods.spacing[i])
+    count = choose(n_found, found, contacts.used[i], contact, rules)
+    count = merge(count, contact, rods.spacing[i])
     for c in range(count):
-        j, fraction = interval_of(curve, contacts[c].arclength, 0)
-        problem.centre[c, 0], problem.centre[c, 1], problem.centre[c, 2] = point_at(curve, j, fraction)
-    world.contacts.used[i] = add_walls(
-        count, contacts, problem.centre, frames, margin, surfaces, stack, problem.wall
-    )
+        j, fraction = interval_of(curve, contact[c].arclength, 0)
+        centre[c, 0], centre[c, 1], centre[c, 2] = point_at(curve, j, fraction)
+    contacts.used[i] = add_walls(count, contact, centre, frames, margin, surfaces, stack, wall)
 
 
 @kernel
@@ -302,7 +313,21 @@ def _iterate_world(world: ContactWorld, rows: ContactRows, problem: ContactProbl
         return LOST if through else AT_REST
     _take_step(fraction, world, problem, rows.x)
     for r in range(world.first, world.last):
-        _renew_contacts(r, world, problem, work.stack)
+        i, o = world.robot[r], r - world.first
+        room = problem.centre, problem.wall
+        n_found, found = problem.n_found[o], problem.found[o]
+        renew_contacts(
+            i,
+            n_found,
+            found,
+            world.rods,
+            world.surfaces,
+            world.motion,
+            world.contacts,
+            room,
+            False,
+            work.stack,
+        )
     search_rods(world.first, world.last, world.robot, rod_search(world), True)
     return GOES_ON
 

@@ -33,7 +33,7 @@ from .motion import (
     note_accelerations,
     start_from_rest,
 )
-from .newton import minimise
+from .newton import hold, minimise
 from .output import ModalOutput, show_chunk
 
 
@@ -60,6 +60,10 @@ class ModalRun(NamedTuple):
     most: int
     remembers: int
     """Scheme for which a robot that was brought to rest starts to remember."""
+    given: Floats
+    """(n_robots, n_q) unknowns at which the robots are held, of length 0 where Newton's method finds them."""
+    ends: bool
+    """Whether what was found is where the robots go on from."""
 
 
 @kernel
@@ -137,7 +141,10 @@ def pass_of_modes(
             curvature_counted_from(b, work)
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
         first = batch.pieces.first_tendon
-        minimise(b, first, command, work, run.tolerance, least, most, robots, batch.host, motion)
+        if len(run.given) > 0:
+            hold(robots, run.given, b, first, command, work)
+        else:
+            minimise(b, first, command, work, run.tolerance, least, most, robots, batch.host, motion)
         follow(work)
         for p in range(work.piece.shape[0]):
             demands_of_stations(p, b, work)
@@ -146,7 +153,7 @@ def pass_of_modes(
             gather_loads(robots, batch.ports, batch.pieces, b, work)
             continue
         note_done(robots, n_robots, run.iterations, output.shape.residual, work)
-        for w in range(n_robots):
+        for w in range(n_robots if run.ends else 0):
             if run.iterations[robots[w]] > 0 and run.kind == REST:
                 start_from_rest(w, robots[w], motion, run.remembers, work)
             elif run.iterations[robots[w]] > 0:

@@ -85,6 +85,10 @@ class ModalDerivatives(NamedTuple):
     """(n_robots, n, n_q) its derivatives by the unknowns."""
     inertia: Floats
     """(n_robots, n) masses [kg], and those of the directors [kg m^2]."""
+    point: Floats
+    """(n_robots, n_points, 3) place of every point force, world [m]."""
+    point_change: Floats
+    """(n_robots, n_points, 3, n_q) its derivatives by the unknowns."""
 
 
 @kernel
@@ -216,6 +220,31 @@ def write_lumps(
 
 
 @kernel
+def write_points(
+    robots: Ints, n_robots: int, batch: ModalBatch, work: ModalWork, out: ModalDerivatives
+) -> None:
+    """Place of the point forces, and its change by the unknowns."""
+    row, n_points, n_modes = work.scratch, batch.points.piece.shape[1], work.end.shape[1]
+    for w in range(n_robots):
+        i = robots[w]
+        for q in range(n_points):
+            p = batch.points.piece[i, q]
+            station = work.station[p, work.station.shape[1] - n_points + q]
+            place = get(station, S_POS, w)
+            for j in range(work.node.shape[1]):
+                row[j] = read(station, S_ROW + j, w)
+            scatter(out.point[i, q], place)
+            for a in range((p + 1) * n_modes):
+                before, c = a // n_modes, a % n_modes
+                if before < p:
+                    moved, _ = carried(before, c, place, w, work)
+                else:
+                    moved = displaced(p, c, row, w, batch.basis, work)
+                for f in range(3):
+                    out.point_change[i, q, f, a] = moved[f]
+
+
+@kernel
 def derivatives_of_modes(
     robots: Ints,
     n_robots: int,
@@ -250,6 +279,8 @@ def derivatives_of_modes(
     if len(out.number) > 0:
         write_nodes(robots, n_robots, batch.basis, work, out)
         write_lumps(robots, n_robots, batch, work, out)
+    if len(out.point) > 0:
+        write_points(robots, n_robots, batch, work, out)
     if len(out.hessian) > 0:
         write_matrix(robots, n_robots, work, 1.0, out.hessian)
     if len(out.damping) > 0:

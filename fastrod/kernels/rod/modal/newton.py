@@ -257,3 +257,19 @@ def minimise(
             for w in range(W):
                 write(newton, L_DONE, w, 1.0 - read(newton, L_AGAIN, w))
     sweep(b, first_tendon, command, work, False)  # a last step may have been undone
+
+
+@kernel
+def hold(
+    robots: Ints, given: Floats, b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork
+) -> None:
+    """The shape at the unknowns `given` (n_robots, n_q), and what its modes work against there."""
+    for w in range(W):
+        for a in range(given.shape[1]):
+            write(work.q, a, w, given[robots[w], a])
+        write(work.newton, L_DONE, w, 1.0)
+        write(work.newton, L_COUNT, w, 1.0)
+        write(work.newton, L_CORRECTION, w, 0.0)
+    sweep(b, first_tendon, command, work, True)
+    follow(work)
+    assemble(b, first_tendon, work)

@@ -1,0 +1,316 @@
+"""`TouchingRods`: rods of modes in motion that feel obstacles.
+
+A step of a rod that touches is one of BDF1, by Newton's method with its contacts as a convex potential
+(`kernels.contact.press`): the contacts of the shape, the rod's Hessian there, their forces. Where that does
+not end, four steps of a quarter are taken for that robot alone, and so on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fastrod.contact.engine import Engine
+from fastrod.contact.frames import blended
+from fastrod.errors import InputError, Problem
+from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.proximity import search_work
+from fastrod.kernels.contact_batch import search_gaps
+from fastrod.kernels.press_batch import end_some, press_some, renew_some
+from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
+from fastrod.solver.inputs import Inputs
+from fastrod.solver.modal import Step
+from fastrod.solver.motion import ModalRods
+from fastrod.solver.protocol import Acting, How, Last, Solved
+from fastrod.solver.settle import unloaded
+from fastrod.solver.stepper import PassShapes, copied
+from fastrod.types import CANDIDATE, Flags, Floats, Ints, Ports, RodShape
+
+_PASSES = 8
+_MOVING = 2  # passes in which contacts follow the places where the gap is least
+_RENEWING = 2  # passes after which the slips that a step is led by are told anew
+_STILL = 1e-6  # rad: a Newton step below it is the last one
+_INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
+_SHORTEST = 4.0**-4  # of a step
+_ROOM = 4  # contacts: room is made for a multiple
+_AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
+_MOST_STEPS, _GROWS = 400, 2.0
+
+
+class TouchingRods(ModalRods):
+    """Rods of modes in motion, bent by what they touch. Free ones take steps of BDF2 where generalized-alpha
+    was asked for: it goes on from a step of BDF1."""
+
+    def __init__(self, engine: Engine, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **{**named, "outputs": "full"})
+        self.engine = engine
+        time = self.stepper.time
+        if time.scheme == GENERALIZED_ALPHA:
+            self.stepper.time = time._replace(scheme=BDF2)
+        self._passes = np.zeros(self.n_robots, np.int64)
+
+    def accept(self, given: Inputs, how: How | None) -> None:
+        """Take how the next step is to be. Raises `InputError` for what rods that touch do not take."""
+        if how is not None and (how.inverse_inertia is not None or how.estimate_error):
+            what = "inverse_inertia" if how.inverse_inertia is not None else "estimate_error"
+            raise InputError(f"{what} was given with a contact scene, which does not take it; leave it out.")
+        if self.engine.surfaces.mobility.any():
+            raise InputError("rods in motion feel no free bodies yet; give obstacle_pose.")
+        super().accept(given, how)
+
+    def step(self, rows: Ints, acting: Acting, last: Last, how: How) -> Solved:
+        """Move these robots on by dt, or bring them to rest."""
+        self._take(acting)
+        engine, stepper, before, ports = self.engine, self.stepper, last.ports, acting.ports
+        cold, warm = rows[~last.warm[rows]], rows[last.warm[rows]]
+        found, ok = self._room(True), np.zeros(self.n_robots, bool)
+        self._passes[:] = 0
+        if len(cold):
+            ok[cold] = self._rest(cold, cold, acting, found, _AT_REST)
+        if len(warm) and before is not None:
+            start, inputs = copied(self.modal.motion), (before, ports)
+            jump, pressed = stepper.jumps(before, ports), engine.pressed()
+            free = warm[~pressed[warm]]
+            ok[free] = stepper.advance(free, inputs, jump, found)
+            self._passes[free] = np.abs(self.modal.iterations[free])
+            touch = pressed | engine.overlap(free[ok[free]], found.shape)
+            some = warm[touch[warm]]
+            _put(self.modal.motion, start, some)
+            ok[some] = self._touch(some, acting, inputs, (0.0, 1.0), found)
+        engine.accept(rows[ok[rows]], found.shape)
+        engine.end_step(ok.astype(float))
+        return self._found(found, ok, ports)
+
+    def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
+        """Bring these robots to rest, to `tolerance` [m] in a step of a second."""
+        self._take(acting)
+        found, ok = self._room(True), np.zeros(self.n_robots, bool)
+        self._passes[:] = 0
+        ok[rows] = self._rest(rows, rows[~last.warm[rows]], acting, found, tolerance)
+        self.engine.accept(rows[ok[rows]], found.shape)
+        self.engine.end_step(ok.astype(float))
+        return self._found(found, ok, acting.ports)
+
+    def _found(self, found: PassShapes, ok: Flags, ports: Ports) -> Solved:
+        """The state, with what has stopped those that are not ok."""
+        solved = self._solved(found, ok, ports)
+        passes = np.where(ok, np.maximum(self._passes, 1), -1)
+        return solved._replace(passes=passes, reason="contact in motion", kind=Problem.CONTACT_STUCK)
+
+    def _rest(
+        self, rows: Ints, cold: Ints, acting: Acting, found: PassShapes, tolerance: float
+    ) -> Flags:
+        """(n_rows,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
+        where they are; cold ones from straight."""
+        engine, modal, ports = self.engine, self.modal, acting.ports
+        mask = np.isin(np.arange(self.n_robots), cold)
+        engine.forget(mask)
+        engine.place_at_once(mask)
+        start, pressed = copied(modal.motion), engine.pressed()
+        ok, free = np.zeros(self.n_robots, bool), rows[~pressed[rows]]
+        ok[free] = self.stepper.rest(free, cold, ports, found, min(tolerance, _AT_REST))
+        touch = rows[(pressed | ~ok | engine.overlap(free[ok[free]], found.shape))[rows]]
+        if not len(touch):
+            return ok[rows]
+        _put(modal.motion, start, touch)
+        ok[touch] = False
+        fresh = touch[mask[touch]]
+        if len(fresh):  # from straight, where that is clear
+            straight = unloaded(ports, modal.layout, modal.params)
+            ok[fresh] = self.stepper.rest(fresh, fresh, straight, found, _AT_REST)
+            ok[fresh] &= ~engine.overlap(fresh[ok[fresh]], found.shape)[fresh]
+            engine.accept(fresh[ok[fresh]], found.shape, between_steps=True)
+            touch = touch[ok[touch] | ~mask[touch]]
+            ok[fresh] = False
+        dt, still, longest = np.full(self.n_robots, self.stepper.time.dt), touch, 1.0
+        for _ in range(_MOST_STEPS):
+            if not len(still):
+                break
+            for size in np.unique(dt[still]):
+                some = still[dt[still] == size]
+                self._hold_up(some)
+                was = modal.motion.place[some].copy()
+                well = self._touch(some, acting, (ports, ports), (0.0, 1.0), found, float(size))
+                engine.accept(some[well], found.shape, between_steps=True)
+                moved = np.abs(modal.motion.place[some] - was).max(1)
+                ok[some] = well & (moved < max(tolerance, _CREEPS)) & (size >= longest)
+                dt[some] = np.where(well, np.minimum(_GROWS * size, longest), 0.25 * size)
+            still = still[~ok[still] & (dt[still] > 1e-9)]
+        self._hold_up(touch)
+        return ok[rows]
+
+    def _hold_up(self, rows: Ints) -> None:
+        """Take the motion of these robots from them."""
+        motion = self.modal.motion
+        for name in ("rate", "velocity", "velocity_other"):
+            getattr(motion, name)[rows] = 0.0
+        motion.q_other[rows], motion.place_other[rows] = motion.q[rows], motion.place[rows]
+
+    # ------------------------------------------------------------ a step in contact
+
+    def _touch(
+        self,
+        rows: Ints,
+        acting: Acting,
+        inputs: tuple[Ports, Ports],
+        span: tuple[float, float],
+        found: PassShapes,
+        length: float | None = None,
+    ) -> Flags:
+        """(n_rows,) who moved on over this fraction `span` of a step of `length` [s] (dt), along which the
+        inputs change evenly; the others are as they were."""
+        if not len(rows):
+            return np.zeros(0, bool)
+        engine, motion, n = self.engine, self.modal.motion, self.n_robots
+        first, last = span
+        whole = self.stepper.time.dt if length is None else length
+        ports = inputs[1] if last >= 1.0 else blended(*inputs, np.full(n, last))
+        start, contacts = _rows_of(motion, rows), _contacts_of(engine, rows)
+        ok = self._one(rows, acting, ports, Step(BDF1, (last - first) * whole), span, found)
+        lost = rows[~ok]
+        _put_contacts(engine, contacts, rows, lost)
+        if not len(lost) or last - first < 1.5 * _SHORTEST:
+            return ok
+        before, left = engine.before, lost
+        for k in range(4):
+            part = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
+            well = self._touch(left, acting, inputs, part, found, length)
+            left = left[well]
+            if k < 3:
+                engine.accept(left, found.shape, between_steps=True)
+        back = lost[~np.isin(lost, left)]
+        _put_rows(motion, start, rows, back)
+        _put_contacts(engine, contacts, rows, back)
+        if before is not None and engine.before is not None:
+            for array, then in zip(engine.before, before, strict=True):
+                array[lost] = then[lost]
+        for name, array in zip(ModalMotion._fields, motion, strict=True):
+            if name.endswith("_other"):  # BDF2 goes on from where the whole step began
+                then = getattr(start, name.removesuffix("_other"))
+                array[left] = then[np.searchsorted(rows, left)]
+        ok[np.isin(rows, left)] = True
+        return ok
+
+    def _one(
+        self,
+        rows: Ints,
+        acting: Acting,
+        ports: Ports,
+        how: Step,
+        span: tuple[float, float],
+        found: PassShapes,
+    ) -> Flags:
+        """(n_rows,) whose Newton's method ended in one step; they are moved on."""
+        engine, modal, n = self.engine, self.modal, self.n_robots
+        motion, contacts = modal.motion, engine.contact_set
+        q = motion.q + how.dt * motion.rate
+        done, left = (np.full(n, fraction) for fraction in span)
+        aim, left = left, rows
+        size, changed, good = np.full(n, np.inf), np.ones(n, bool), np.zeros(n, bool)
+        contacts.contact["slid"][rows] = 0.0
+        for count in range(_PASSES + 1):
+            world, near, n_found = self._seen(left, ports, how, q, found, done, aim)
+            if count == 0 and (n_found < 0).any():  # at that speed it would go through: from where it is
+                q[left[n_found < 0]] = motion.q[left[n_found < 0]]
+                world, near, n_found = self._seen(left, ports, how, q, found, done, aim)
+            rest = (size < _STILL) & ~changed & (engine.clearance.gap > -_INSIDE)
+            good[left[rest[left] & (n_found >= 0)]] = True
+            keep = ~good[left]
+            left, near, n_found = left[keep], near[keep], np.maximum(n_found[keep], 0)
+            if not len(left) or count == _PASSES:
+                break
+            renew_some(left, engine.rods, engine.surfaces, world, contacts, near, n_found, count >= _MOVING)
+            given = self._place(left, acting, ports)
+            zero = np.zeros(n)
+            d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, zero))
+            step = np.zeros_like(q)
+            press_some(
+                left,
+                engine.rods,
+                engine.surfaces,
+                world,
+                contacts,
+                d.hessian,
+                d.gradient,
+                d.point_change,
+                given,
+                count < _RENEWING,
+                step,
+                changed,
+            )
+            q[left] += step[left]
+            size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
+            self._passes[left] += 1
+            lost = ~np.isfinite(q[left]).all(1)
+            q[left[lost]] = motion.q[left[lost]]
+            left = left[~lost]
+        arrived = rows[good[rows]]
+        if len(arrived):
+            self._place(arrived, acting, ports)
+            modal.hold(arrived, ports, *found, how, q, True)
+            end_some(arrived, contacts)
+        modal.place_points(*acting.points, ports.extension)
+        return good[rows]
+
+    def _seen(
+        self,
+        rows: Ints,
+        ports: Ports,
+        how: Step,
+        q: Floats,
+        found: PassShapes,
+        done: Floats,
+        aim: Floats,
+    ) -> tuple[Any, Any, Ints]:
+        """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
+        through."""
+        engine = self.engine
+        self.modal.hold(rows, ports, *found, how, q, False)
+        world = engine.motion(found.shape, _INSIDE, done, aim)
+        near, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
+        threads = engine.thread_count(len(rows))
+        work = search_work(threads, found.shape.arclength.shape[1])
+        search_gaps(threads, rows, engine.rods, engine.surfaces, world, near, n_found, work)
+        return world, near, n_found
+
+    def _place(self, rows: Ints, acting: Acting, ports: Ports) -> int:
+        """Let the contacts of these robots act as point forces beside those that are given, and return how
+        many these are."""
+        contacts = self.engine.contact_set
+        arclength, force = acting.points
+        most = -(-int(contacts.used[rows].max(initial=0)) // _ROOM) * _ROOM
+        there = np.arange(most) < contacts.used[:, None]
+        every = contacts.contact[:, :most]
+        s = np.where(there, every["arclength"], 0.0)
+        f = np.where(there[:, :, None], every["force"], 0.0)
+        given = arclength.shape[1]
+        if given:
+            s = np.concatenate([np.broadcast_to(arclength, (self.n_robots, given)), s], axis=1)
+            f = np.concatenate([np.broadcast_to(force, (self.n_robots, given, 3)), f], axis=1)
+        self.modal.place_points(s, f, ports.extension)
+        return given
+
+
+def _rows_of(motion: ModalMotion, rows: Ints) -> ModalMotion:
+    return ModalMotion(*(a[rows] for a in motion))
+
+
+def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
+    for array, old in zip(motion, then, strict=True):
+        array[rows] = old[rows]
+
+
+def _put_rows(motion: ModalMotion, then: ModalMotion, every: Ints, rows: Ints) -> None:
+    """`then` holds the robots `every`, of which `rows` go back to it."""
+    for array, old in zip(motion, then, strict=True):
+        array[rows] = old[np.isin(every, rows)]
+
+
+def _contacts_of(engine: Engine, rows: Ints) -> tuple[Ints, Any]:
+    return engine.contact_set.used[rows].copy(), engine.contact_set.contact[rows].copy()
+
+
+def _put_contacts(engine: Engine, then: tuple[Ints, Any], every: Ints, rows: Ints) -> None:
+    some = np.isin(every, rows)
+    engine.contact_set.used[rows], engine.contact_set.contact[rows] = then[0][some], then[1][some]
