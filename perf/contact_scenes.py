@@ -12,7 +12,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -253,12 +253,23 @@ class Played:
     sentences: list[str] = field(default_factory=list)
 
 
-def play(batch: Batch, rows: list[int] | None = None, **options: Any) -> Played:
-    """Step a batch, or some of its scenes, and sample every rod after every step."""
+def with_mass(robot: Robot) -> Robot:
+    """A robot that can move: what has no mass gets one, and some damping."""
+    segments = (
+        replace(s, line_density=s.line_density or 0.05, damping_time=s.damping_time or 5e-3)
+        for s in robot.segments
+    )
+    return replace(robot, segments=tuple(segments))
+
+
+def play(batch: Batch, rows: list[int] | None = None, *, dt: float = 0.0, **options: Any) -> Played:
+    """Step a batch, or some of its scenes, and sample every rod after every step; with `dt` [s] in
+    motion."""
     some = list(range(batch.pose.shape[1])) if rows is None else rows
     n, name = len(some), batch.obstacle.name
     scene = ContactScene(obstacles=[batch.obstacle], rod_radius=batch.rod_radius, **options)
-    sim = Simulator(batch.robot, n, points_per_segment=batch.points, threads=1, contact=scene)
+    robot, more = (with_mass(batch.robot), {"dt": dt, "dynamics": True}) if dt else (batch.robot, {})
+    sim = Simulator(robot, n, points_per_segment=batch.points, threads=1, contact=scene, **more)
     ok, touching, passes, depth = (np.zeros((N_STEPS + 1, n), kind) for kind in (bool, bool, int, float))
     played = Played(batch.kind, ok, touching, depth * np.nan, np.zeros(N_STEPS + 1), passes)
     for k in range(N_STEPS + 1):
@@ -291,10 +302,17 @@ def row(kind: str, some: list[Played]) -> Row:
     }
 
 
+def _dt(options: Any, index: int) -> float:
+    """0 at rest; in motion 1 to 20 ms, another for each batch."""
+    return (
+        float(1e-3 * 20.0 ** np.random.default_rng((options.seed, index)).random()) if options.moving else 0.0
+    )
+
+
 def measure(options: Any) -> list[Section]:
     """The table by kind, and the sentences."""
     seed, count = options.seed, TOGETHER if options.quick else options.count
-    play(make_batch(seed, options.first))  # compiled, and not timed
+    play(make_batch(seed, options.first), dt=_dt(options, 0))  # compiled, and not timed
     every, said, silent, end = (
         list[Played](),
         Counter[str](),
@@ -307,7 +325,7 @@ def measure(options: Any) -> list[Section]:
             break
         note_progress(f"batch {index}")
         batch = make_batch(seed, index)
-        played = play(batch)
+        played = play(batch, dt=_dt(options, index))
         every.append(played)
         said.update(re.sub(r"-?\d[\d.e+-]*", "#", sentence) for sentence in played.sentences)
         words = f"{batch.robot.name}, {batch.points} steps a segment, {batch.kind}"
@@ -340,6 +358,7 @@ main = bench(
     __doc__,
     measure,
     ("--count", 10_000, "scenes"),
+    ("--moving", False, "rods with mass, in steps of 1 to 20 ms"),
     ("--seed", 1, "of all scenes"),
     ("--first", 0, "batch to begin with"),
     ("--minutes", np.inf, "stop after so long"),

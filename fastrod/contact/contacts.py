@@ -96,9 +96,8 @@ def contacts_of(
         return np.where(beyond.reshape(*beyond.shape, *[1] * (kept[name].ndim - 2)), np.nan, kept[name])
 
     normal, force, s = field("normal"), field("force"), field("arclength")
-    nodes = np.abs(np.where(beyond, 0.0, kept["arclength"])[:, :, None] - shape.arclength[:, None, :])
-    at = np.where(np.isfinite(nodes), nodes, np.inf).argmin(2)  # every contact has a node of its own
-    point = np.take_along_axis(shape.position, at[:, :, None], axis=1) - field("radius")[:, :, None] * normal
+    centre = _centreline(shape, np.where(beyond, 0.0, kept["arclength"]))
+    point = centre - field("radius")[:, :, None] * normal
     index = np.where(beyond, -1, kept["obstacle"])
     wrench = np.zeros((n, n_obstacles, 6))
     origin = np.broadcast_to(poses[:, :, :3], (n, n_obstacles, 3))
@@ -122,3 +121,15 @@ def contacts_of(
         deep=ok & (clearance.gap < -thinnest),
         tip_arclength=shape.arclength[:, -1],
     )
+
+
+def _centreline(shape: RodShape, s: Floats) -> Floats:
+    """(n, m, 3) of the centreline at arclengths (n, m), between the nodes by Hermite's cubic."""
+    robot = np.arange(len(s))[:, None]
+    node = np.clip((s[:, :, None] >= shape.arclength[:, None, 1:-1]).sum(2), 0, shape.arclength.shape[1] - 2)
+    first, last = (shape.arclength[robot, node + k] for k in range(2))
+    h = (last - first)[..., None]
+    t = (s - first)[..., None] / h
+    p0, p1 = (shape.position[robot, node + k] for k in range(2))
+    t0, t1 = (h * shape.rotation[robot, node + k][..., 2] for k in range(2))
+    return np.asarray(p0 + t * t * (3.0 - 2.0 * t) * (p1 - p0) + t * (1.0 - t) * ((1.0 - t) * t0 - t * t1))

@@ -51,27 +51,17 @@ def press_some(
     n_q, most = gradient.shape[1], contacts.contact.shape[1]
     axes, along = np.empty((most, 3, 3)), np.empty((most, 3, n_q))
     free, law = np.empty((most, 3)), np.empty((most, 5))
-    matrix, room = np.empty((n_q, n_q)), np.empty((3, n_q))
+    curved, matrix, room = np.empty((most, 3, 3)), np.empty((n_q, n_q)), np.empty((3, n_q))
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
     for r in range(len(rows)):
         i = rows[r]
         n, contact = contacts.used[i], contacts.contact[i]
         for c in range(n):
             margin = motion.margin * rods.length[i]
-            measure_contact(
-                i, contact[c], motion, surfaces, margin, stack, wall, axes[c], free[c], law[c]
-            )
+            room_of_it = axes[c], free[c], law[c], curved[c]
+            measure_contact(i, contact[c], motion, surfaces, margin, stack, wall, room_of_it)
         pressing = Pressing(
-            hessian[i],
-            gradient[i],
-            change[i, first:],
-            axes,
-            along,
-            free,
-            law,
-            matrix,
-            step[i],
-            room,
+            hessian[i], gradient[i], change[i, first:], axes, along, free, law, curved, matrix, step[i], room
         )
         _, changed[i] = press(n, contact, pressing, renew)
 

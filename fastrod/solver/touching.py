@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.contact.engine import Engine
-from fastrod.contact.frames import blended
+from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem
 from fastrod.kernels.contact.problem import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
@@ -21,11 +21,12 @@ from fastrod.kernels.press_batch import end_some, press_some, renew_some
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.modal import Step
+from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
-from fastrod.types import CANDIDATE, Flags, Floats, Ints, Ports, RodShape
+from fastrod.types import CANDIDATE, Flags, Floats, Ints, Ports
 
 _PASSES = 8
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
@@ -98,9 +99,7 @@ class TouchingRods(ModalRods):
         passes = np.where(ok, np.maximum(self._passes, 1), -1)
         return solved._replace(passes=passes, reason="contact in motion", kind=Problem.CONTACT_STUCK)
 
-    def _rest(
-        self, rows: Ints, cold: Ints, acting: Acting, found: PassShapes, tolerance: float
-    ) -> Flags:
+    def _rest(self, rows: Ints, cold: Ints, acting: Acting, found: PassShapes, tolerance: float) -> Flags:
         """(n_rows,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
         where they are; cold ones from straight."""
         engine, modal, ports = self.engine, self.modal, acting.ports
@@ -170,6 +169,7 @@ class TouchingRods(ModalRods):
         ok = self._one(rows, acting, ports, Step(BDF1, (last - first) * whole), span, found)
         lost = rows[~ok]
         _put_contacts(engine, contacts, rows, lost)
+        self._measure_anew(lost)
         if not len(lost) or last - first < 1.5 * _SHORTEST:
             return ok
         before, left = engine.before, lost
@@ -177,6 +177,7 @@ class TouchingRods(ModalRods):
             part = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
             well = self._touch(left, acting, inputs, part, found, length)
             left = left[well]
+            self._measure_anew(left)
             if k < 3:
                 engine.accept(left, found.shape, between_steps=True)
         back = lost[~np.isin(lost, left)]
@@ -191,6 +192,12 @@ class TouchingRods(ModalRods):
                 array[left] = then[np.searchsorted(rows, left)]
         ok[np.isin(rows, left)] = True
         return ok
+
+    def _measure_anew(self, rows: Ints) -> None:
+        """What is known of the distance of these robots holds for obstacles elsewhere on their way."""
+        engine = self.engine
+        moved = longest_move(engine.poses_before, engine.poses, engine.surfaces.sphere)
+        engine.clearance.distance[rows] -= np.broadcast_to(moved, self.n_robots)[rows, None]
 
     def _one(
         self,
@@ -221,7 +228,7 @@ class TouchingRods(ModalRods):
             if not len(left) or count == _PASSES:
                 break
             renew_some(left, engine.rods, engine.surfaces, world, contacts, near, n_found, count >= _MOVING)
-            given = self._place(left, acting, ports)
+            modal.place_points(*self._points(left, acting), ports.extension)
             zero = np.zeros(n)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, zero))
             step = np.zeros_like(q)
@@ -234,7 +241,7 @@ class TouchingRods(ModalRods):
                 d.hessian,
                 d.gradient,
                 d.point_change,
-                given,
+                acting.points[0].shape[1],
                 count < _RENEWING,
                 step,
                 changed,
@@ -247,21 +254,14 @@ class TouchingRods(ModalRods):
             left = left[~lost]
         arrived = rows[good[rows]]
         if len(arrived):
-            self._place(arrived, acting, ports)
+            modal.place_points(*self._points(arrived, acting), ports.extension)
             modal.hold(arrived, ports, *found, how, q, True)
             end_some(arrived, contacts)
         modal.place_points(*acting.points, ports.extension)
         return good[rows]
 
     def _seen(
-        self,
-        rows: Ints,
-        ports: Ports,
-        how: Step,
-        q: Floats,
-        found: PassShapes,
-        done: Floats,
-        aim: Floats,
+        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, done: Floats, aim: Floats
     ) -> tuple[Any, Any, Ints]:
         """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
         through."""
@@ -274,9 +274,16 @@ class TouchingRods(ModalRods):
         search_gaps(threads, rows, engine.rods, engine.surfaces, world, near, n_found, work)
         return world, near, n_found
 
-    def _place(self, rows: Ints, acting: Acting, ports: Ports) -> int:
-        """Let the contacts of these robots act as point forces beside those that are given, and return how
-        many these are."""
+    def linear(self, acting: Acting, warm: Flags) -> ModalLinear:
+        """Return the linear response of the last shape, contact forces held."""
+        self._take(acting)
+        rows = np.flatnonzero(warm)
+        points = self._points(rows, acting)
+        self.modal.place_points(*points, acting.ports.extension)
+        return ModalLinear(self.modal, rows, acting.ports, points)
+
+    def _points(self, rows: Ints, acting: Acting) -> tuple[Floats, Floats]:
+        """Point forces: those that are given, then the contacts of these robots."""
         contacts = self.engine.contact_set
         arclength, force = acting.points
         most = -(-int(contacts.used[rows].max(initial=0)) // _ROOM) * _ROOM
@@ -288,8 +295,7 @@ class TouchingRods(ModalRods):
         if given:
             s = np.concatenate([np.broadcast_to(arclength, (self.n_robots, given)), s], axis=1)
             f = np.concatenate([np.broadcast_to(force, (self.n_robots, given, 3)), f], axis=1)
-        self.modal.place_points(s, f, ports.extension)
-        return given
+        return s, f
 
 
 def _rows_of(motion: ModalMotion, rows: Ints) -> ModalMotion:

@@ -243,8 +243,10 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     near = rules.tolerance if rules.still else _SAME_GAP if contact.arm > 0.0 else 0.0
-    if candidate.gap >= contact.gap - near or rules.still:
-        return candidate.gap >= contact.gap - near
+    if candidate.gap >= contact.gap - near:
+        return True
+    if rules.still:
+        return False
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
     if settles or not carries(contact) or contact.arm > 0.0:

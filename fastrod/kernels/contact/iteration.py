@@ -251,8 +251,8 @@ def renew_contacts(
     still: bool,
     stack: Numbers,
 ) -> None:
-    """The contacts of robot i for its next pass, from its candidates (`ContactRules.still`). `room` is for the centreline at each
-    contact (max_contacts, 3) and the walls of a corner."""
+    """The contacts of robot i for its next pass, from its candidates (`ContactRules.still`). `room` is for
+    the centreline at each contact (max_contacts, 3) and the walls of a corner."""
     contact, frames, curve = (
         contacts.contact[i],
         motion.frames[pick(i, len(motion.frames))],

@@ -3,11 +3,13 @@
 Of every candidate the motion of its point is linear in the unknowns, u = (gap, slip since the step's start)
 + J dq. Its potential is R/2 |lambda|^2 with
   lambda = P_K(y),   y_n = -(u_n + mu s) / R,   y_t = t - u_t / R,
-K the cone |lambda_t| <= mu lambda_n, P_K the nearest point in it, t the force along the surface with which the
-last step ended (so that what sticks does not creep), s how far the point slips (the shift of De Saxce and
-Feng 1998, by which a point that slips does not lift). Its derivatives by u are -lambda and D / R, D = P_K'.
-With the rod's own g and H the step minimises dq.H.dq / 2 + g.dq + sum of potentials: a semi-smooth Newton
-method whose steps end where the slope along them does (Castro and others 2022).
+K the cone |lambda_t| <= mu lambda_n, P_K the nearest point in it, t the force along the surface with which
+the last step ended (so that what sticks does not creep), s how far the point slips (the shift of De Saxce
+and Feng 1998, by which a point that slips does not lift). Its derivatives by u are -lambda and D / R,
+D = P_K'. With the rod's own g and H the step minimises dq.H.dq / 2 + g.dq + sum of potentials: a semi-smooth
+Newton method whose steps end where the slope along them does (Castro and others 2022). To H belongs what the
+forces turn with a curved surface, - lambda_n times the second derivative of the gap, where H with it is
+still positive.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from .assemble import tangents
 from .bvh import Numbers, Record, normal_of
 from .centreline import curve_of, curve_slip, interval_of, point_at
 from .contact_set import set_normal, wall_at
+from .surface import surface_curvature
 from .tunnelling import carried
 
 SOFT = 1e-8
@@ -52,6 +55,8 @@ class Pressing(NamedTuple):
     """(n_contacts, 3) gap and slip without a step [m]."""
     law: Floats
     """(n_contacts, 5) mu, R, t (2), s."""
+    curved: Floats
+    """(n_contacts, 3, 3) second derivative of the gap by the place, world [1/m]."""
     matrix: Floats
     """(n_q, n_q)"""
     step: Floats
@@ -74,11 +79,11 @@ def measure_contact(
     margin: float,
     stack: Numbers,
     wall: Records,
-    axes: Floats,
-    free: Floats,
-    law: Floats,
+    room: tuple[Floats, Floats, Floats, Floats],
 ) -> None:
-    """Gap and normal of a contact on the present shape, kept in it, and what its potential needs."""
+    """Gap and normal of a contact on the present shape, kept in it; and its `axes`, `free`, `law` and
+    `curved` (`Pressing`) into `room`."""
+    axes, free, law, curved = room
     curve, k = curve_of(motion, i), contact.obstacle
     j, fraction = interval_of(curve, contact.arclength, 0)
     p = point_at(curve, j, fraction)
@@ -100,6 +105,13 @@ def measure_contact(
     law[0] = surfaces.friction[k] if slides else 0.0
     law[1] = SOFT + surfaces.compliance[k]
     law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
+    first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
+    if d > 0.0:
+        first, second, e = surface_curvature(k, frame, p, surfaces, stack)
+    for a in range(3):
+        for b in range(3):
+            across = (1.0 if a == b else 0.0) - n[a] * n[b]
+            curved[a, b] = first * across + (second - first) * e[a] * e[b]
 
 
 @inline
@@ -171,9 +183,10 @@ def _slope_along(n: int, pressing: Pressing, at: Floats, step: Floats) -> float:
 
 
 @kernel
-def _newton_step(n: int, pressing: Pressing, to: Floats) -> None:
-    """A Newton step from `pressing.step`, into `to`; a pivot that is none is the diagonal's."""
-    m, n_q, step = pressing.matrix, len(to), pressing.step
+def _newton_step(n: int, pressing: Pressing, to: Floats) -> bool:
+    """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive; the diagonal
+    stands for one that is not."""
+    m, n_q, step, good = pressing.matrix, len(to), pressing.step, True
     for a in range(n_q):
         value = pressing.room[2, a]
         for c in range(n_q):
@@ -199,7 +212,7 @@ def _newton_step(n: int, pressing: Pressing, to: Floats) -> None:
         for k in range(j):
             pivot -= m[j, k] * m[j, k]
         if not pivot > _PIVOT * abs(m[j, j]):
-            pivot = abs(m[j, j]) + 1e-300
+            pivot, good = abs(m[j, j]) + 1e-300, False
         inverse = 1.0 / math.sqrt(pivot)
         m[j, j] = inverse
         for a in range(j + 1, n_q):
@@ -216,18 +229,35 @@ def _newton_step(n: int, pressing: Pressing, to: Floats) -> None:
         for k in range(a + 1, n_q):
             to[a] -= m[k, a] * to[k]
         to[a] *= m[a, a]
+    return good
+
+
+@kernel
+def _turn_forces(n: int, contacts: Records, pressing: Pressing, sign: float) -> bool:
+    """Take from the Hessian what the forces turn with their surfaces (`sign` 1), or give it back; whether
+    there is any."""
+    n_q, some = len(pressing.step), False
+    for k in range(n):
+        axes, c, change = pressing.axes[k], pressing.curved[k], pressing.change[k]
+        force = contacts[k].force
+        pressed = force[0] * axes[0, 0] + force[1] * axes[0, 1] + force[2] * axes[0, 2]
+        if not pressed > 0.0 or c[0, 0] + c[1, 1] + c[2, 2] == 0.0:
+            continue
+        some = True
+        for a in range(n_q):
+            for r in range(3):
+                turned = c[r, 0] * change[0, a] + c[r, 1] * change[1, a] + c[r, 2] * change[2, a]
+                turned *= sign * pressed
+                for b in range(n_q):
+                    pressing.hessian[a, b] -= turned * change[r, b]
+    return some
 
 
 @kernel
 def press(n: int, contacts: Records, pressing: Pressing, renew: bool) -> tuple[float, bool]:
     """Step and forces of one robot with n contacts, which hold its `law` and `free`; the largest change of
     an unknown, and whether a slip that the step was led by has changed, if it may be told anew."""
-    n_q, step, rest, trial = (
-        len(pressing.step),
-        pressing.step,
-        pressing.room[2],
-        pressing.room[1],
-    )
+    n_q, step, rest, trial = (len(pressing.step), pressing.step, pressing.room[2], pressing.room[1])
     for a in range(n_q):
         rest[a], step[a] = pressing.gradient[a], 0.0
     for k in range(n):
@@ -237,9 +267,12 @@ def press(n: int, contacts: Records, pressing: Pressing, renew: bool) -> tuple[f
             rest[a] += x * force[0] + y * force[1] + z * force[2]
             for r in range(3):
                 pressing.along[k, r, a] = axes[r, 0] * x + axes[r, 1] * y + axes[r, 2] * z
-    to = pressing.room[0]
+    to, turned = pressing.room[0], _turn_forces(n, contacts, pressing, 1.0)
     for _ in range(_ROUNDS):
-        _newton_step(n, pressing, to)
+        if not _newton_step(n, pressing, to) and turned:
+            _turn_forces(n, contacts, pressing, -1.0)
+            turned = False
+            _newton_step(n, pressing, to)
         low, high, fraction = 0.0, 1.0, 1.0
         first = abs(_slope_along(n, pressing, step, to))
         for _ in range(_HALVINGS):
