@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Literal, NamedTuple, get_args
@@ -48,6 +48,14 @@ _MOST = 200
 def _pool(n_threads: int) -> ThreadPoolExecutor:
     """Threads that run one kernel, which holds no lock of Python: for `prange` it would be compiled twice."""
     return ThreadPoolExecutor(n_threads)
+
+
+def in_threads(tasks: int, run: Callable[[int], None]) -> None:
+    """Call `run` for each task, side by side where there are several."""
+    if tasks == 1:
+        run(0)
+    else:
+        list(_pool(tasks).map(run, range(tasks)))
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
@@ -283,21 +291,13 @@ class ModalSolver:
         given: Floats | None = None,
         ends: bool = True,
     ) -> None:
-        chunks = -(-len(rows) // LANES)
-        tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
-        each = LANES * -(-chunks // tasks)
         batch = self._batch(ports, self.motion, self.host)
-        output, work = ModalOutput(self.samples, shape, moving), self._workspace(tasks)
+        output = ModalOutput(self.samples, shape, moving)
 
-        def run_some(task: int) -> None:
-            some = rows[task * each : (task + 1) * each]
-            run = self._run_of(some, how, jump, effort, remembers, given, ends)
-            pass_modes(run, batch, output, ModalWork(*(room[task : task + 1] for room in work)))
+        def run_some(some: Ints, work: ModalWork) -> None:
+            pass_modes(self._run_of(some, how, jump, effort, remembers, given, ends), batch, output, work)
 
-        if tasks == 1:
-            run_some(0)
-        else:
-            list(_pool(tasks).map(run_some, range(tasks)))
+        self._share_out(rows, run_some)
         # of what fades away each pass leaves less, in the end numbers below the normal ones: with these a
         # pass takes four times as long
         for array in self.motion[:3]:
@@ -406,10 +406,22 @@ class ModalSolver:
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )
         how, jump = (Step(REST, 1.0), None) if step is None else step[1:]
-        run = self._run_of(rows, how, jump, (0.0, 1, 1), REST)
         batch = self._batch(ports, motion, no_hosts())
-        derive_modes(run, batch, q, self._workspace(1), found)
+
+        def derive_some(some: Ints, work: ModalWork) -> None:
+            derive_modes(self._run_of(some, how, jump, (0.0, 1, 1), REST), batch, q, work, found)
+
+        self._share_out(rows, derive_some)
         return found
+
+    def _share_out(self, rows: Ints, run: Callable[[Ints, ModalWork], None]) -> None:
+        """Call `run` with some of the rows and a workspace for these, on so many threads."""
+        chunks = -(-len(rows) // LANES)
+        tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
+        each, room = LANES * -(-chunks // tasks), self._workspace(tasks)
+        in_threads(
+            tasks, lambda k: run(rows[k * each : (k + 1) * each], ModalWork(*(a[k : k + 1] for a in room)))
+        )
 
     def _workspace(self, tasks: int) -> ModalWork:
         """Kept: to make one takes as long as a step of one robot."""

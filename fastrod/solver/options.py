@@ -175,15 +175,10 @@ def check_fellows(solver: Observer | Modal, contact: Any, feel_contact: bool, de
                 f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
             )
     if isinstance(solver, Modal):
-        if felt and not solver.dynamics:
-            raise InputError(
-                "contact was given with rods of modes at rest, which feel none; take dynamics=True, "
-                "solver='observer', or feel_contact=False."
-            )
         if felt and (contact.self_contact or contact.worlds is not None):
             raise InputError(
-                "contact was given with rods in motion, which feel obstacles whose motion is given and no "
-                "more yet; leave out self_contact, worlds and free bodies."
+                "contact was given with rods of modes, which feel obstacles whose motion is given and no "
+                "more yet; leave out self_contact and worlds, or take solver='observer'."
             )
         if device == "cuda":
             raise InputError("device was given with rods of modes, which do not take it; leave it out.")

@@ -1,12 +1,15 @@
-"""`TouchingRods`: rods of modes in motion that feel obstacles.
+"""`TouchingRods`: rods of modes that feel obstacles, in motion and at rest.
 
 A step of a rod that touches is one of BDF1, by Newton's method with its contacts as a convex potential
 (`kernels.contact.press`): the contacts of the shape, the rod's Hessian there, their forces. Where that does
-not end, four steps of a quarter are taken for that robot alone, and so on.
+not end, four steps of a quarter are taken for that robot alone, and so on. A rest is the end of such steps
+that are held up after each; rods that never move have a mass for them that is no one's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +22,16 @@ from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact_batch import search_gaps
 from fastrod.kernels.press_batch import end_some, press_some, renew_some
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
+from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
-from fastrod.solver.modal import Step
+from fastrod.solver.modal import Step, in_threads
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
+from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
-from fastrod.types import CANDIDATE, Flags, Floats, Ints, Ports
+from fastrod.types import CANDIDATE, ContactMotion, Flags, Floats, Ints, Ports
 
 _PASSES = 8
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
@@ -36,20 +41,46 @@ _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _SHORTEST = 4.0**-4  # of a step
 _ROOM = 4  # contacts: room is made for a multiple
 _AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
-_MOST_STEPS, _GROWS = 400, 2.0
+_MOST_STEPS, _GROWS, _LONGEST = 400, 2.0, 1.0  # steps to a rest, and their length [s]
+_SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
 class TouchingRods(ModalRods):
     """Rods of modes in motion, bent by what they touch. Free ones take steps of BDF2 where generalized-alpha
     was asked for: it goes on from a step of BDF1."""
 
-    def __init__(self, engine: Engine, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **{**named, "outputs": "full"})
+    def __init__(
+        self, engine: Engine, options: Modal, robots: tuple[Robot, ...], *given: Any, **named: Any
+    ) -> None:
+        # a force between its ends makes a kink in the curvature of a segment
+        pieces = 2 if robots[0].n_segments == 1 else 1
+        usual = Modes(4, 2, pieces=pieces) if options.dynamics else Modes(6, 4, pieces=pieces)
+        options = replace(options, modes=options.modes or usual)
+        super().__init__(options, robots, *given, **{**named, "outputs": "full"})
         self.engine = engine
+        self._weigh()
         time = self.stepper.time
         if time.scheme == GENERALIZED_ALPHA:
             self.stepper.time = time._replace(scheme=BDF2)
         self._passes = np.zeros(self.n_robots, np.int64)
+
+    def replace(self, robots: Sequence[Robot]) -> None:
+        """Take other robots of the same layout; a recording ends."""
+        super().replace(robots)
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """Give robots that only rest a mass for the steps to it, such that they would ring at some Hz."""
+        if self.dynamics:
+            return
+        pieces = self.modal.pieces
+        mass = [
+            _SLOW**2 * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**4
+            for robot in self.robots
+        ]
+        rotary = [[0.25 * s.body_radius**2 for s in robot.segments] for robot in self.robots]
+        each = np.stack([np.ones_like(rotary), rotary, rotary], axis=-1)
+        self.modal.pieces = pieces._replace(density=np.array(mass)[:, None, None] * each)
 
     def accept(self, given: Inputs, how: How | None) -> None:
         """Take how the next step is to be. Raises `InputError` for what rods that touch do not take."""
@@ -67,9 +98,11 @@ class TouchingRods(ModalRods):
         cold, warm = rows[~last.warm[rows]], rows[last.warm[rows]]
         found, ok = self._room(True), np.zeros(self.n_robots, bool)
         self._passes[:] = 0
-        if len(cold):
+        if not self.dynamics:
+            ok[rows] = self._rest(rows, cold, acting, found, _AT_REST)
+        elif len(cold):
             ok[cold] = self._rest(cold, cold, acting, found, _AT_REST)
-        if len(warm) and before is not None:
+        if self.dynamics and len(warm) and before is not None:
             start, inputs = copied(self.modal.motion), (before, ports)
             jump, pressed = stepper.jumps(before, ports), engine.pressed()
             free = warm[~pressed[warm]]
@@ -97,7 +130,8 @@ class TouchingRods(ModalRods):
         """The state, with what has stopped those that are not ok."""
         solved = self._solved(found, ok, ports)
         passes = np.where(ok, np.maximum(self._passes, 1), -1)
-        return solved._replace(passes=passes, reason="contact in motion", kind=Problem.CONTACT_STUCK)
+        reason = "contact in motion" if self.dynamics else "contact"
+        return solved._replace(passes=passes, reason=reason, kind=Problem.CONTACT_STUCK)
 
     def _rest(self, rows: Ints, cold: Ints, acting: Acting, found: PassShapes, tolerance: float) -> Flags:
         """(n_rows,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
@@ -122,7 +156,7 @@ class TouchingRods(ModalRods):
             engine.accept(fresh[ok[fresh]], found.shape, between_steps=True)
             touch = touch[ok[touch] | ~mask[touch]]
             ok[fresh] = False
-        dt, still, longest = np.full(self.n_robots, self.stepper.time.dt), touch, 1.0
+        dt, still, longest = np.where(mask | self.dynamics, self.stepper.time.dt, _LONGEST), touch, _LONGEST
         for _ in range(_MOST_STEPS):
             if not len(still):
                 break
@@ -132,6 +166,7 @@ class TouchingRods(ModalRods):
                 was = modal.motion.place[some].copy()
                 well = self._touch(some, acting, (ports, ports), (0.0, 1.0), found, float(size))
                 engine.accept(some[well], found.shape, between_steps=True)
+                engine.place_at_once(np.isin(np.arange(self.n_robots), some[well]))
                 moved = np.abs(modal.motion.place[some] - was).max(1)
                 ok[some] = well & (moved < max(tolerance, _CREEPS)) & (size >= longest)
                 dt[some] = np.where(well, np.minimum(_GROWS * size, longest), 0.25 * size)
@@ -232,20 +267,8 @@ class TouchingRods(ModalRods):
             zero = np.zeros(n)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, zero))
             step = np.zeros_like(q)
-            press_some(
-                left,
-                engine.rods,
-                engine.surfaces,
-                world,
-                contacts,
-                d.hessian,
-                d.gradient,
-                d.point_change,
-                acting.points[0].shape[1],
-                count < _RENEWING,
-                step,
-                changed,
-            )
+            model = d.hessian, d.gradient, d.point_change, acting.points[0].shape[1], count < _RENEWING
+            self._press(left, world, model, (step, changed))
             q[left] += step[left]
             size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
             self._passes[left] += 1
@@ -259,6 +282,13 @@ class TouchingRods(ModalRods):
             end_some(arrived, contacts)
         modal.place_points(*acting.points, ports.extension)
         return good[rows]
+
+    def _press(self, rows: Ints, world: ContactMotion, model: Any, out: Any) -> None:
+        """`press_some` on so many threads."""
+        engine = self.engine
+        shares = np.array_split(rows, engine.thread_count(len(rows)))
+        given: Any = (engine.rods, engine.surfaces, world, engine.contact_set, *model, *out)
+        in_threads(len(shares), lambda task: press_some(shares[task], *given))
 
     def _seen(
         self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, done: Floats, aim: Floats

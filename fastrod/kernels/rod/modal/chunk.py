@@ -142,7 +142,7 @@ def pass_of_modes(
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
         first = batch.pieces.first_tendon
         if len(run.given) > 0:
-            hold(robots, run.given, b, first, command, work)
+            hold(robots, run.given, b, first, command, work, run.ends)
         else:
             minimise(b, first, command, work, run.tolerance, least, most, robots, batch.host, motion)
         follow(work)

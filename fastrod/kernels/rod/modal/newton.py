@@ -261,15 +261,23 @@ def minimise(
 
 @kernel
 def hold(
-    robots: Ints, given: Floats, b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork
+    robots: Ints,
+    given: Floats,
+    b: ModalBasis,
+    first_tendon: Ints,
+    command: Floats,
+    work: ModalWork,
+    with_forces: bool,
 ) -> None:
-    """The shape at the unknowns `given` (n_robots, n_q), and what its modes work against there."""
+    """The shape at the unknowns `given` (n_robots, n_q), and `with_forces` what its modes work against
+    there."""
     for w in range(W):
         for a in range(given.shape[1]):
             write(work.q, a, w, given[robots[w], a])
         write(work.newton, L_DONE, w, 1.0)
         write(work.newton, L_COUNT, w, 1.0)
         write(work.newton, L_CORRECTION, w, 0.0)
-    sweep(b, first_tendon, command, work, True)
-    follow(work)
-    assemble(b, first_tendon, work)
+    sweep(b, first_tendon, command, work, with_forces)
+    if with_forces:
+        follow(work)
+        assemble(b, first_tendon, work)
