@@ -75,7 +75,7 @@ class Simulator(RobotBatch):
 
         `contact` is what the rods may touch; without it they pass through everything. Without `feel_contact`
         they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone.
-        Rods of modes feel obstacles whose motion is given, and no free bodies or other rods yet.
+        Rods of modes feel it in motion too.
 
         `threads` defaults to numba's. With `device="cuda"` the observer's passes run on an NVIDIA GPU, one
         thread a robot, from the same source: numbers agree to rounding. The memory of the observer stays

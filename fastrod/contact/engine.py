@@ -215,7 +215,7 @@ class Engine:
     def lower_gaps(self, rows: Ints, motion: ContactMotion) -> None:
         """Lower the gaps of these robots in `motion` to those between rods."""
         search = RodSearch(motion, self.rods, self.contact_set, motion.frames.shape[1], 0.0)
-        search_worlds(self.in_worlds(rows), search)
+        search_worlds(self.in_worlds(rows), search, False)
 
     def accept(self, rows: Ints, shape: RodShape, between_steps: bool = False) -> None:
         """These robots are at rest in `shape`: from there they slip and move. `between_steps`: it will

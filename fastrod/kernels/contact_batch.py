@@ -162,10 +162,11 @@ def cast_rays(
 
 
 @entry
-def search_worlds(rows: ContactRows, search: RodSearch) -> None:
-    """Lower each robot's smallest gap to that between rods (`search_rods`)."""
+def search_worlds(rows: ContactRows, search: RodSearch, add: bool) -> None:
+    """Lower each robot's smallest gap to that between rods, and with `add` renew their contacts
+    (`search_rods`)."""
     for k in range(len(rows.start) - 1):
-        search_rods(rows.start[k], rows.start[k + 1], rows.robot, search, False)
+        search_rods(rows.start[k], rows.start[k + 1], rows.robot, search, add)
 
 
 iterate_contact = OnThreads(iterate_some, _iterate_on_threads)

@@ -1,14 +1,27 @@
-"""Rods of modes that touch obstacles: what Python calls."""
+"""Rods of modes that touch: what Python calls."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fastrod.types import WALL, ContactMotion, ContactRods, ContactSet, Flags, Floats, Ints, Records, Surfaces
+from fastrod.types import (
+    WALL,
+    ContactMotion,
+    ContactRods,
+    ContactRows,
+    ContactSet,
+    Flags,
+    Floats,
+    Ints,
+    Records,
+    Surfaces,
+)
 
 from .contact.bvh import STACK
+from .contact.contact_set import violation
 from .contact.iteration import renew_contacts
-from .contact.press import Pressing, end_contacts, measure_contact, press
+from .contact.press import Pressing, Touching, end_contacts, gather_world, press
+from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
 from .jit import entry
 
@@ -32,8 +45,31 @@ def renew_some(
 
 
 @entry
+def violations(
+    rows: ContactRows, search: RodSearch, surfaces: Surfaces, found: Records, n_found: Ints, worst: Floats
+) -> None:
+    """How far each robot's world is beyond what its contacts hold [m]."""
+    for k in range(len(rows.start) - 1):
+        first, last, deepest = rows.start[k], rows.start[k + 1], 0.0
+        for r in range(first, last):
+            i = rows.robot[r]
+            used, contact, spacing = (
+                search.contacts.used[i],
+                search.contacts.contact[i],
+                search.rods.spacing[i],
+            )
+            deep, _ = violation(max(n_found[r], 0), found[r], used, contact, spacing, surfaces)
+            deepest = max(deepest, deep)
+        if last - first > 1 or search.rods.own:
+            deepest = max(deepest, search_rods(first, last, rows.robot, search, False))
+        for r in range(first, last):
+            worst[rows.robot[r]] = deepest
+
+
+@entry
 def press_some(
-    rows: Ints,
+    start: Ints,
+    robot: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
     motion: ContactMotion,
@@ -42,28 +78,41 @@ def press_some(
     gradient: Floats,
     change: Floats,
     first: int,
+    yielding: float,
     renew: bool,
     step: Floats,
     changed: Flags,
 ) -> None:
-    """Step (n_robots, n_q) and forces of these robots (`press`), and whose slips were told anew. `change`
-    (n_robots, n_points, 3, n_q): motion of points, their contacts from the `first` on."""
-    n_q, most = gradient.shape[1], contacts.contact.shape[1]
-    axes, along = np.empty((most, 3, 3)), np.empty((most, 3, n_q))
-    free, law = np.empty((most, 3)), np.empty((most, 5))
-    curved, matrix, room = np.empty((most, 3, 3)), np.empty((n_q, n_q)), np.empty((3, n_q))
+    """Step (n_robots, n_q) and forces of these worlds (`press`), and whose slips were told anew."""
+    n_q, most, n_rows = gradient.shape[1], contacts.contact.shape[1], 0
+    for k in range(len(start) - 1):
+        n_rows = max(n_rows, start[k + 1] - start[k])
+    n, m = n_rows * n_q + 6 * len(surfaces.primitive), n_rows * most
+    if not surfaces.mobility.any():
+        n = n_rows * n_q
+    pressing = Pressing(
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty((m, 4), np.int64),
+        np.empty((m, 3, 3)),
+        np.empty((m, 3, n)),
+        np.empty((m, 3)),
+        np.empty((m, 5)),
+        np.empty((m, 3, 3)),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty((2, n)),
+    )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
-    for r in range(len(rows)):
-        i = rows[r]
-        n, contact = contacts.used[i], contacts.contact[i]
-        for c in range(n):
-            margin = motion.margin * rods.length[i]
-            room_of_it = axes[c], free[c], law[c], curved[c]
-            measure_contact(i, contact[c], motion, surfaces, margin, stack, wall, room_of_it)
-        pressing = Pressing(
-            hessian[i], gradient[i], change[i, first:], axes, along, free, law, curved, matrix, step[i], room
-        )
-        _, changed[i] = press(n, contact, pressing, renew)
+    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, first, yielding)
+    for k in range(len(start) - 1):
+        count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
+        told = press(count, unknowns, contacts, pressing, renew)
+        for o in range(start[k + 1] - start[k]):
+            i = robot[start[k] + o]
+            changed[i] = told
+            for a in range(n_q):
+                step[i, a] = pressing.step[o * n_q + a]
 
 
 @entry

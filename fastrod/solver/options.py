@@ -164,9 +164,8 @@ def solver_of(
     return modal if dynamics or soft or solver == "modal" else own or Observer()
 
 
-def check_fellows(solver: Observer | Modal, contact: Any, feel_contact: bool, device: str) -> None:
+def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool, device: str) -> None:
     """Raise `InputError` for a contact scene that is none, and for options that do not go together."""
-    felt = contact is not None and feel_contact
     if contact is not None:
         from fastrod.contact.scene import ContactScene
 
@@ -174,15 +173,9 @@ def check_fellows(solver: Observer | Modal, contact: Any, feel_contact: bool, de
             raise InputError(
                 f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
             )
-    if isinstance(solver, Modal):
-        if felt and (contact.self_contact or contact.worlds is not None):
-            raise InputError(
-                "contact was given with rods of modes, which feel obstacles whose motion is given and no "
-                "more yet; leave out self_contact and worlds, or take solver='observer'."
-            )
-        if device == "cuda":
-            raise InputError("device was given with rods of modes, which do not take it; leave it out.")
-    if device == "cuda" and felt:
+    if isinstance(solver, Modal) and device == "cuda":
+        raise InputError("device was given with rods of modes, which do not take it; leave it out.")
+    if device == "cuda" and contact is not None and feel_contact:
         raise InputError(
             "contact was given with device 'cuda', where rods feel none; take "
             "device='cpu', or feel_contact=False."

@@ -19,8 +19,9 @@ from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem
 from fastrod.kernels.contact.problem import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
-from fastrod.kernels.contact_batch import search_gaps
-from fastrod.kernels.press_batch import end_some, press_some, renew_some
+from fastrod.kernels.contact.rod_proximity import RodSearch
+from fastrod.kernels.contact_batch import search_gaps, search_worlds
+from fastrod.kernels.press_batch import end_some, press_some, renew_some, violations
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
@@ -31,7 +32,7 @@ from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
-from fastrod.types import CANDIDATE, ContactMotion, Flags, Floats, Ints, Ports
+from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports
 
 _PASSES = 8
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
@@ -41,7 +42,7 @@ _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _SHORTEST = 4.0**-4  # of a step
 _ROOM = 4  # contacts: room is made for a multiple
 _AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
-_MOST_STEPS, _GROWS, _LONGEST = 400, 2.0, 1.0  # steps to a rest, and their length [s]
+_MOST_STEPS, _GROWS, _LONGEST, _GIVEN_UP = 400, 2.0, 1.0, 1e-9  # steps to a rest, and their length [s]
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
@@ -87,92 +88,84 @@ class TouchingRods(ModalRods):
         if how is not None and (how.inverse_inertia is not None or how.estimate_error):
             what = "inverse_inertia" if how.inverse_inertia is not None else "estimate_error"
             raise InputError(f"{what} was given with a contact scene, which does not take it; leave it out.")
-        if self.engine.surfaces.mobility.any():
-            raise InputError("rods in motion feel no free bodies yet; give obstacle_pose.")
         super().accept(given, how)
 
     def step(self, rows: Ints, acting: Acting, last: Last, how: How) -> Solved:
         """Move these robots on by dt, or bring them to rest."""
-        self._take(acting)
-        engine, stepper, before, ports = self.engine, self.stepper, last.ports, acting.ports
-        cold, warm = rows[~last.warm[rows]], rows[last.warm[rows]]
-        found, ok = self._room(True), np.zeros(self.n_robots, bool)
-        self._passes[:] = 0
-        if not self.dynamics:
-            ok[rows] = self._rest(rows, cold, acting, found, _AT_REST)
-        elif len(cold):
-            ok[cold] = self._rest(cold, cold, acting, found, _AT_REST)
-        if self.dynamics and len(warm) and before is not None:
-            start, inputs = copied(self.modal.motion), (before, ports)
-            jump, pressed = stepper.jumps(before, ports), engine.pressed()
+        engine, stepper, before = self.engine, self.stepper, last.ports
+        found, cold = self._begin(acting), engine.whole_worlds(self._mask(rows) & ~last.warm)
+        ok, warm = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, found, _AT_REST), rows
+        warm = rows[~cold[rows]] if self.dynamics and before is not None else rows[:0]
+        if len(warm) and before is not None:
+            start, inputs = copied(self.modal.motion), (before, acting.ports)
+            jump, pressed = stepper.jumps(*inputs), engine.pressed()
             free = warm[~pressed[warm]]
             ok[free] = stepper.advance(free, inputs, jump, found)
             self._passes[free] = np.abs(self.modal.iterations[free])
             touch = pressed | engine.overlap(free[ok[free]], found.shape)
             some = warm[touch[warm]]
             _put(self.modal.motion, start, some)
-            ok[some] = self._touch(some, acting, inputs, (0.0, 1.0), found)
-        engine.accept(rows[ok[rows]], found.shape)
-        engine.end_step(ok.astype(float))
-        return self._found(found, ok, ports)
+            ok[some] = self._touch(some, acting, inputs, (0.0, 1.0), found)[some]
+        return self._end(rows, ok, found, acting)
 
     def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
         """Bring these robots to rest, to `tolerance` [m] in a step of a second."""
+        found, cold = self._begin(acting), self.engine.whole_worlds(self._mask(rows) & ~last.warm)
+        return self._end(rows, self._rest(rows, cold, acting, found, tolerance), found, acting)
+
+    def _begin(self, acting: Acting) -> PassShapes:
         self._take(acting)
-        found, ok = self._room(True), np.zeros(self.n_robots, bool)
         self._passes[:] = 0
-        ok[rows] = self._rest(rows, rows[~last.warm[rows]], acting, found, tolerance)
+        return self._room(True)
+
+    def _end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting) -> Solved:
+        """The state, with what has stopped those that are not ok."""
         self.engine.accept(rows[ok[rows]], found.shape)
         self.engine.end_step(ok.astype(float))
-        return self._found(found, ok, acting.ports)
-
-    def _found(self, found: PassShapes, ok: Flags, ports: Ports) -> Solved:
-        """The state, with what has stopped those that are not ok."""
-        solved = self._solved(found, ok, ports)
+        solved = self._solved(found, ok, acting.ports)
         passes = np.where(ok, np.maximum(self._passes, 1), -1)
         reason = "contact in motion" if self.dynamics else "contact"
         return solved._replace(passes=passes, reason=reason, kind=Problem.CONTACT_STUCK)
 
-    def _rest(self, rows: Ints, cold: Ints, acting: Acting, found: PassShapes, tolerance: float) -> Flags:
-        """(n_rows,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
-        where they are; cold ones from straight."""
-        engine, modal, ports = self.engine, self.modal, acting.ports
-        mask = np.isin(np.arange(self.n_robots), cold)
-        engine.forget(mask)
-        engine.place_at_once(mask)
-        start, pressed = copied(modal.motion), engine.pressed()
-        ok, free = np.zeros(self.n_robots, bool), rows[~pressed[rows]]
-        ok[free] = self.stepper.rest(free, cold, ports, found, min(tolerance, _AT_REST))
-        touch = rows[(pressed | ~ok | engine.overlap(free[ok[free]], found.shape))[rows]]
-        if not len(touch):
-            return ok[rows]
-        _put(modal.motion, start, touch)
-        ok[touch] = False
-        fresh = touch[mask[touch]]
-        if len(fresh):  # from straight, where that is clear
+    def _mask(self, rows: Ints) -> Flags:
+        return np.isin(np.arange(self.n_robots), rows)
+
+    def _rest(self, rows: Ints, cold: Flags, acting: Acting, found: PassShapes, tolerance: float) -> Flags:
+        """(n_robots,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
+        where they are; `cold` ones from straight."""
+        engine, modal, ports, ok = self.engine, self.modal, acting.ports, np.zeros(self.n_robots, bool)
+        engine.forget(cold)
+        engine.place_at_once(cold)
+        start, pressed, fresh = copied(modal.motion), engine.pressed(), rows[cold[rows]]
+        free = rows[~pressed[rows]]
+        ok[free] = self.stepper.rest(free, fresh, ports, found, min(tolerance, _AT_REST))
+        touch = engine.whole_worlds(pressed | (self._mask(free) & ~ok))
+        touch |= engine.overlap(free[~touch[free]], found.shape)
+        _put(modal.motion, start, still := rows[touch[rows]])
+        ok[still] = False
+        if len(fresh := fresh[touch[fresh]]):  # from straight, where that is clear
             straight = unloaded(ports, modal.layout, modal.params)
-            ok[fresh] = self.stepper.rest(fresh, fresh, straight, found, _AT_REST)
-            ok[fresh] &= ~engine.overlap(fresh[ok[fresh]], found.shape)[fresh]
-            engine.accept(fresh[ok[fresh]], found.shape, between_steps=True)
-            touch = touch[ok[touch] | ~mask[touch]]
-            ok[fresh] = False
-        dt, still, longest = np.where(mask | self.dynamics, self.stepper.time.dt, _LONGEST), touch, _LONGEST
-        for _ in range(_MOST_STEPS):
+            clear = self._mask(fresh[self.stepper.rest(fresh, fresh, straight, found, _AT_REST)])
+            clear &= ~engine.whole_worlds(engine.overlap(np.flatnonzero(clear), found.shape))
+            engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
+            still = still[clear[still] | ~cold[still]]
+        size, tried = np.where(cold | self.dynamics, self.stepper.time.dt, _LONGEST), still
+        for _ in range(_MOST_STEPS if len(still) else 0):
+            for each in np.unique(size[still]):
+                some = still[size[still] == each]
+                self._hold_up(some)
+                was = modal.motion.place.copy()
+                well = self._touch(some, acting, (ports, ports), (0.0, 1.0), found, float(each))
+                engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
+                engine.place_at_once(well)
+                moved = np.abs(modal.motion.place - was).max(1) >= max(tolerance, _CREEPS)
+                ok[some] = (well & ~engine.whole_worlds(moved))[some] & (each >= _LONGEST)
+                size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), 0.25 * each)
+            still = still[~ok[still] & (size[still] > _GIVEN_UP)]
             if not len(still):
                 break
-            for size in np.unique(dt[still]):
-                some = still[dt[still] == size]
-                self._hold_up(some)
-                was = modal.motion.place[some].copy()
-                well = self._touch(some, acting, (ports, ports), (0.0, 1.0), found, float(size))
-                engine.accept(some[well], found.shape, between_steps=True)
-                engine.place_at_once(np.isin(np.arange(self.n_robots), some[well]))
-                moved = np.abs(modal.motion.place[some] - was).max(1)
-                ok[some] = well & (moved < max(tolerance, _CREEPS)) & (size >= longest)
-                dt[some] = np.where(well, np.minimum(_GROWS * size, longest), 0.25 * size)
-            still = still[~ok[still] & (dt[still] > 1e-9)]
-        self._hold_up(touch)
-        return ok[rows]
+        self._hold_up(tried)
+        return ok
 
     def _hold_up(self, rows: Ints) -> None:
         """Take the motion of these robots from them."""
@@ -192,41 +185,43 @@ class TouchingRods(ModalRods):
         found: PassShapes,
         length: float | None = None,
     ) -> Flags:
-        """(n_rows,) who moved on over this fraction `span` of a step of `length` [s] (dt), along which the
-        inputs change evenly; the others are as they were."""
-        if not len(rows):
-            return np.zeros(0, bool)
+        """(n_robots,) who of these, in whole worlds, moved on over this fraction `span` of a step of `length`
+        [s] (dt), along which the inputs change evenly; the others are as they were."""
         engine, motion, n = self.engine, self.modal.motion, self.n_robots
-        first, last = span
+        (first, last), ok = span, np.zeros(n, bool)
+        if not len(rows):
+            return ok
         whole = self.stepper.time.dt if length is None else length
         ports = inputs[1] if last >= 1.0 else blended(*inputs, np.full(n, last))
-        start, contacts = _rows_of(motion, rows), _contacts_of(engine, rows)
+        start, contacts = copied(motion), ContactSet(*(a.copy() for a in engine.contact_set))
         ok = self._one(rows, acting, ports, Step(BDF1, (last - first) * whole), span, found)
-        lost = rows[~ok]
-        _put_contacts(engine, contacts, rows, lost)
+        left = lost = rows[~ok[rows]]
+        self._go_back(lost, contacts)
         self._measure_anew(lost)
         if not len(lost) or last - first < 1.5 * _SHORTEST:
             return ok
-        before, left = engine.before, lost
+        before = engine.before
         for k in range(4):
             part = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
-            well = self._touch(left, acting, inputs, part, found, length)
-            left = left[well]
+            left = left[self._touch(left, acting, inputs, part, found, length)[left]]
             self._measure_anew(left)
             if k < 3:
                 engine.accept(left, found.shape, between_steps=True)
-        back = lost[~np.isin(lost, left)]
-        _put_rows(motion, start, rows, back)
-        _put_contacts(engine, contacts, rows, back)
+        ok[left] = True
+        back = lost[~ok[lost]]
+        _put(motion, start, back)
+        self._go_back(back, contacts)
         if before is not None and engine.before is not None:
             for array, then in zip(engine.before, before, strict=True):
                 array[lost] = then[lost]
         for name, array in zip(ModalMotion._fields, motion, strict=True):
             if name.endswith("_other"):  # BDF2 goes on from where the whole step began
-                then = getattr(start, name.removesuffix("_other"))
-                array[left] = then[np.searchsorted(rows, left)]
-        ok[np.isin(rows, left)] = True
+                array[left] = getattr(start, name.removesuffix("_other"))[left]
         return ok
+
+    def _go_back(self, rows: Ints, then: ContactSet) -> None:
+        for array, old in zip(self.engine.contact_set, then, strict=True):
+            array[rows] = old[rows]
 
     def _measure_anew(self, rows: Ints) -> None:
         """What is known of the distance of these robots holds for obstacles elsewhere on their way."""
@@ -243,61 +238,70 @@ class TouchingRods(ModalRods):
         span: tuple[float, float],
         found: PassShapes,
     ) -> Flags:
-        """(n_rows,) whose Newton's method ended in one step; they are moved on."""
-        engine, modal, n = self.engine, self.modal, self.n_robots
-        motion, contacts = modal.motion, engine.contact_set
-        q = motion.q + how.dt * motion.rate
-        done, left = (np.full(n, fraction) for fraction in span)
-        aim, left = left, rows
-        size, changed, good = np.full(n, np.inf), np.ones(n, bool), np.zeros(n, bool)
+        """(n_robots,) who moved on in one step: those in whose world Newton's method has ended."""
+        engine, modal, n, motion = self.engine, self.modal, self.n_robots, self.modal.motion
+        contacts, q, left = engine.contact_set, motion.q + how.dt * motion.rate, rows
+        size, deep, ok = np.full(n, np.inf), np.zeros(n), np.zeros(n, bool)
+        changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
         for count in range(_PASSES + 1):
-            world, near, n_found = self._seen(left, ports, how, q, found, done, aim)
-            if count == 0 and (n_found < 0).any():  # at that speed it would go through: from where it is
-                q[left[n_found < 0]] = motion.q[left[n_found < 0]]
-                world, near, n_found = self._seen(left, ports, how, q, found, done, aim)
-            rest = (size < _STILL) & ~changed & (engine.clearance.gap > -_INSIDE)
-            good[left[rest[left] & (n_found >= 0)]] = True
-            keep = ~good[left]
+            worlds = engine.in_worlds(left)
+            left = worlds.robot
+            world, near, n_found = self._seen(left, ports, how, q, found, span)
+            through = self._mask(left[n_found < 0])
+            if count == 0 and through.any():  # at that speed it would go through: from where it is
+                q[through] = motion.q[through]
+                world, near, n_found = self._seen(left, ports, how, q, found, span)
+                through = self._mask(left[n_found < 0])
+            search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin)
+            violations(worlds, search, engine.surfaces, near, n_found, deep)
+            busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
+            ok |= self._mask(left) & ~engine.whole_worlds(busy & self._mask(left))
+            keep = ~ok[left]
             left, near, n_found = left[keep], near[keep], np.maximum(n_found[keep], 0)
             if not len(left) or count == _PASSES:
                 break
-            renew_some(left, engine.rods, engine.surfaces, world, contacts, near, n_found, count >= _MOVING)
+            still, seen = count >= _MOVING, (engine.rods, engine.surfaces, world, contacts)
+            renew_some(left, *seen, near, n_found, still)
+            if engine.rods_meet and not still:
+                search_worlds(engine.in_worlds(left), search, True)
             modal.place_points(*self._points(left, acting), ports.extension)
-            zero = np.zeros(n)
-            d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, zero))
-            step = np.zeros_like(q)
-            model = d.hessian, d.gradient, d.point_change, acting.points[0].shape[1], count < _RENEWING
-            self._press(left, world, model, (step, changed))
+            d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
+            yielding = (span[1] - span[0]) ** 2
+            model = d.hessian, d.gradient, d.point_change, acting.points[0].shape[1], yielding
+            self._press(left, (*seen, *model, count < _RENEWING, step, changed))
             q[left] += step[left]
             size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
             self._passes[left] += 1
-            lost = ~np.isfinite(q[left]).all(1)
-            q[left[lost]] = motion.q[left[lost]]
-            left = left[~lost]
-        arrived = rows[good[rows]]
-        if len(arrived):
+            lost = engine.whole_worlds(np.asarray(~np.isfinite(q).all(1)))
+            q[lost] = motion.q[lost]
+            left = left[~lost[left]]
+        if len(arrived := np.flatnonzero(ok)):
             modal.place_points(*self._points(arrived, acting), ports.extension)
             modal.hold(arrived, ports, *found, how, q, True)
             end_some(arrived, contacts)
         modal.place_points(*acting.points, ports.extension)
-        return good[rows]
+        return ok
 
-    def _press(self, rows: Ints, world: ContactMotion, model: Any, out: Any) -> None:
+    def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""
-        engine = self.engine
-        shares = np.array_split(rows, engine.thread_count(len(rows)))
-        given: Any = (engine.rods, engine.surfaces, world, engine.contact_set, *model, *out)
-        in_threads(len(shares), lambda task: press_some(shares[task], *given))
+        start, robot = self.engine.in_worlds(rows)[:2]
+        shares = np.array_split(np.arange(len(start) - 1), self.engine.thread_count(len(start) - 1))
+
+        def press(task: int) -> None:
+            some = shares[task]
+            press_some(start[some[0] : some[-1] + 2], robot, *given)
+
+        in_threads(len(shares), press)
 
     def _seen(
-        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, done: Floats, aim: Floats
-    ) -> tuple[Any, Any, Ints]:
+        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[float, float]
+    ) -> tuple[ContactMotion, Any, Ints]:
         """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
         through."""
-        engine = self.engine
+        engine, n = self.engine, self.n_robots
         self.modal.hold(rows, ports, *found, how, q, False)
-        world = engine.motion(found.shape, _INSIDE, done, aim)
+        world = engine.motion(found.shape, _INSIDE, np.full(n, span[0]), np.full(n, span[1]))
         near, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         threads = engine.thread_count(len(rows))
         work = search_work(threads, found.shape.arclength.shape[1])
@@ -328,25 +332,6 @@ class TouchingRods(ModalRods):
         return s, f
 
 
-def _rows_of(motion: ModalMotion, rows: Ints) -> ModalMotion:
-    return ModalMotion(*(a[rows] for a in motion))
-
-
 def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
     for array, old in zip(motion, then, strict=True):
         array[rows] = old[rows]
-
-
-def _put_rows(motion: ModalMotion, then: ModalMotion, every: Ints, rows: Ints) -> None:
-    """`then` holds the robots `every`, of which `rows` go back to it."""
-    for array, old in zip(motion, then, strict=True):
-        array[rows] = old[np.isin(every, rows)]
-
-
-def _contacts_of(engine: Engine, rows: Ints) -> tuple[Ints, Any]:
-    return engine.contact_set.used[rows].copy(), engine.contact_set.contact[rows].copy()
-
-
-def _put_contacts(engine: Engine, then: tuple[Ints, Any], every: Ints, rows: Ints) -> None:
-    some = np.isin(every, rows)
-    engine.contact_set.used[rows], engine.contact_set.contact[rows] = then[0][some], then[1][some]

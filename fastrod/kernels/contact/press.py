@@ -1,4 +1,4 @@
-"""Contact of one rod of modes, as a convex potential in its Newton's method.
+"""Contact of the rods of modes of one world, as a convex potential in their Newton's method.
 
 Of every candidate the motion of its point is linear in the unknowns, u = (gap, slip since the step's start)
 + J dq. Its potential is R/2 |lambda|^2 with
@@ -9,7 +9,8 @@ and Feng 1998, by which a point that slips does not lift). Its derivatives by u 
 D = P_K'. With the rod's own g and H the step minimises dq.H.dq / 2 + g.dq + sum of potentials: a semi-smooth
 Newton method whose steps end where the slope along them does (Castro and others 2022). To H belongs what the
 forces turn with a curved surface, - lambda_n times the second derivative of the gap, where H with it is
-still positive.
+still positive. Rods are coupled by their contacts alone; a free body has six unknowns more, its
+displacement within the step and the moment on it.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fastrod.types import ContactMotion, Floats, Records, Surfaces
+from fastrod.types import ContactMotion, ContactRods, ContactSet, Floats, Ints, Records, Surfaces
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
-from ..vec import Vec, dot, scale, sub
+from ..vec import Vec, axpy, cross, dot, scale, sub
 from .assemble import tangents
 from .bvh import Numbers, Record, normal_of
 from .centreline import curve_of, curve_slip, interval_of, point_at
 from .contact_set import set_normal, wall_at
+from .rod_proximity import partner_of
 from .surface import surface_curvature
 from .tunnelling import carried
 
@@ -39,30 +41,49 @@ _RENEWED = 5e-6  # m: a slip that changes by less is not told to the next pass
 
 
 class Pressing(NamedTuple):
-    """The rod of one robot near its present unknowns, and room for its contacts."""
+    """The rods and free bodies of one world near their present unknowns, and room for its contacts."""
 
     hessian: Floats
-    """(n_q, n_q) of the rod, the forces of its contacts as dead loads."""
+    """(n, n) of the rods, the forces of their contacts as dead loads."""
     gradient: Floats
-    """(n_q,) with these."""
-    change: Floats
-    """(n_contacts, 3, n_q) motion of the contact points by the unknowns, world."""
+    """(n,) without these forces."""
+    side: Ints
+    """(n_contacts, 4) robot and number of a contact, and of its other side, or -1."""
     axes: Floats
     """(n_contacts, 3, 3) normal and two tangents."""
     along: Floats
-    """(n_contacts, 3, n_q) J: motion along these."""
+    """(n_contacts, 3, n) J: motion along these."""
     free: Floats
     """(n_contacts, 3) gap and slip without a step [m]."""
     law: Floats
     """(n_contacts, 5) mu, R, t (2), s."""
     curved: Floats
-    """(n_contacts, 3, 3) second derivative of the gap by the place, world [1/m]."""
+    """(n_contacts, 3, 3) second derivative of the gap by the place, along the axes [1/m]."""
     matrix: Floats
-    """(n_q, n_q)"""
+    """(n, n)"""
     step: Floats
-    """(n_q,) out: change of the unknowns."""
+    """(n,) out: change of the unknowns."""
     room: Floats
-    """(3, n_q)"""
+    """(2, n)"""
+
+
+class Touching(NamedTuple):
+    """All rods of a batch among the obstacles, and how they are to be pressed."""
+
+    rods: ContactRods
+    surfaces: Surfaces
+    motion: ContactMotion
+    contacts: ContactSet
+    hessian: Floats
+    """(n_robots, n_q, n_q) of each rod, its contacts' forces as dead loads."""
+    gradient: Floats
+    """(n_robots, n_q) with these."""
+    change: Floats
+    """(n_robots, n_points, 3, n_q) motion of points by the unknowns, world."""
+    first: int
+    """Number of the first contact among these points."""
+    yielding: float
+    """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
 
 
 @inline
@@ -70,41 +91,33 @@ def _axis(axes: Floats, a: int) -> Vec:
     return axes[a, 0], axes[a, 1], axes[a, 2]
 
 
+@inline
+def _place(i: int, s: float, motion: ContactMotion) -> tuple[Vec, int]:
+    curve = curve_of(motion, i)
+    j, fraction = interval_of(curve, s, 0)
+    return point_at(curve, j, fraction), j
+
+
+@inline
+def _place_before(i: int, s: float, near: int, motion: ContactMotion) -> Vec:
+    before = curve_slip(motion, i)
+    j, fraction = interval_of(before, s, near)
+    return point_at(before, j, fraction)
+
+
 @kernel
-def measure_contact(
-    i: int,
-    contact: Record,
-    motion: ContactMotion,
-    surfaces: Surfaces,
-    margin: float,
-    stack: Numbers,
-    wall: Records,
-    room: tuple[Floats, Floats, Floats, Floats],
-) -> None:
-    """Gap and normal of a contact on the present shape, kept in it; and its `axes`, `free`, `law` and
-    `curved` (`Pressing`) into `room`."""
-    axes, free, law, curved = room
-    curve, k = curve_of(motion, i), contact.obstacle
-    j, fraction = interval_of(curve, contact.arclength, 0)
-    p = point_at(curve, j, fraction)
+def _measure_obstacle(
+    i: int, contact: Record, all_of_it: Touching, stack: Numbers, wall: Records, curved: Floats
+) -> Vec:
+    """Gap and normal of a contact with an obstacle, kept in it, the second derivative of the gap, and the
+    slip since the step's start (world)."""
+    motion, surfaces, k = all_of_it.motion, all_of_it.surfaces, contact.obstacle
+    p, j = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
+    margin = motion.margin * all_of_it.rods.length[i]
     d, n = wall_at(k, frame, p, normal_of(contact), margin, surfaces, stack, wall)
     contact.gap = d - contact.radius
     set_normal(contact, n)
-    t1, t2 = tangents(n)
-    for a in range(3):
-        axes[0, a], axes[1, a], axes[2, a] = n[a], t1[a], t2[a]
-    slip, slides = (0.0, 0.0, 0.0), motion.slides[i]
-    if slides:
-        before = curve_slip(motion, i)
-        ground = carried(frame, motion.frames_slip[pick(i, len(motion.frames_slip)), k], p)
-        j, fraction = interval_of(before, contact.arclength, j)
-        slip = sub(ground, point_at(before, j, fraction))
-    held = (contact.held[0], contact.held[1], contact.held[2])
-    free[0], free[1], free[2] = contact.gap, dot(slip, t1), dot(slip, t2)
-    law[0] = surfaces.friction[k] if slides else 0.0
-    law[1] = SOFT + surfaces.compliance[k]
-    law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
     first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
     if d > 0.0:
         first, second, e = surface_curvature(k, frame, p, surfaces, stack)
@@ -112,13 +125,169 @@ def measure_contact(
         for b in range(3):
             across = (1.0 if a == b else 0.0) - n[a] * n[b]
             curved[a, b] = first * across + (second - first) * e[a] * e[b]
+    if not motion.slides[i]:
+        return 0.0, 0.0, 0.0
+    ground = carried(frame, motion.frames_slip[pick(i, len(motion.frames_slip)), k], p)
+    return sub(ground, _place_before(i, contact.arclength, j, motion))
+
+
+@kernel
+def _measure_rods(
+    i: int, contact: Record, other: int, partner: Record, motion: ContactMotion, curved: Floats
+) -> Vec:
+    """The same of a contact between two rods, kept in both its sides."""
+    (p, j), (r, k) = _place(i, contact.arclength, motion), _place(other, partner.arclength, motion)
+    e, old, thick = sub(p, r), normal_of(contact), contact.radius + partner.radius
+    length, along = math.sqrt(dot(e, e)), dot(e, old)
+    n, gap = old, along - thick
+    if along > 0.2 * length and length > 1e-12:
+        n, gap = scale(1.0 / length, e), length - thick
+    set_normal(contact, n)
+    set_normal(partner, scale(-1.0, n))
+    contact.gap, partner.gap = gap, gap
+    for a in range(3):
+        for b in range(3):
+            across = (1.0 if a == b else 0.0) - n[a] * n[b]
+            curved[a, b] = across / length if length > 1e-12 else 0.0
+    if not (motion.slides[i] and motion.slides[other]):
+        return 0.0, 0.0, 0.0
+    before = sub(
+        _place_before(i, contact.arclength, j, motion), _place_before(other, partner.arclength, k, motion)
+    )
+    return sub(e, before)
+
+
+@kernel
+def _add_motion(
+    m: int, row: int, i: int, q: int, sign: float, all_of_it: Touching, pressing: Pressing
+) -> None:
+    """Add the motion of point q of robot i, in this row of its world, to that of contact m."""
+    change, axes, n_q = all_of_it.change[i, all_of_it.first + q], pressing.axes[m], all_of_it.change.shape[3]
+    for a in range(n_q):
+        for r in range(3):
+            moved = axes[r, 0] * change[0, a] + axes[r, 1] * change[1, a] + axes[r, 2] * change[2, a]
+            pressing.along[m, r, row * n_q + a] += sign * moved
+
+
+@kernel
+def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: Pressing) -> None:
+    """Take the motion of a free body there from that of contact m: displacement, and rotation by the moment
+    on it, unknowns `at` on."""
+    arm = sub(place, (mobility[10], mobility[11], mobility[12]))
+    for r in range(3):
+        axis = _axis(pressing.axes[m], r)
+        turned = cross(arm, axis)
+        for a in range(3):
+            pressing.along[m, r, at + a] -= axis[a]
+            by_moment = (
+                mobility[1 + a] * turned[0] + mobility[4 + a] * turned[1] + mobility[7 + a] * turned[2]
+            )
+            pressing.along[m, r, at + 3 + a] -= by_moment
+
+
+@kernel
+def gather_world(
+    first: int, last: int, robot: Ints, all_of_it: Touching, pressing: Pressing, stack: Numbers, wall: Records
+) -> tuple[int, int]:
+    """The world in the rows `first` to `last` into `pressing`; how many contacts and unknowns it has."""
+    n_q, surfaces, contacts = all_of_it.gradient.shape[1], all_of_it.surfaces, all_of_it.contacts
+    n_obstacles, n, m = len(surfaces.primitive), (last - first) * all_of_it.gradient.shape[1], 0
+    most = n
+    for k in range(n_obstacles):
+        most = n + 6 * n_obstacles if surfaces.mobility[k, 0] > 0.0 else most
+    for a in range(most):
+        pressing.gradient[a] = 0.0
+        for b in range(most):
+            pressing.hessian[a, b] = 0.0
+    for o in range(last - first):
+        i = robot[first + o]
+        for a in range(n_q):
+            pressing.gradient[o * n_q + a] = all_of_it.gradient[i, a]
+            for b in range(n_q):
+                pressing.hessian[o * n_q + a, o * n_q + b] = all_of_it.hessian[i, a, b]
+    for o in range(last - first):
+        i = robot[first + o]
+        for q in range(contacts.used[i]):
+            contact, k, other, partner = contacts.contact[i, q], contacts.contact[i, q].obstacle, -1, -1
+            row = -1
+            if k >= n_obstacles:
+                other = k - n_obstacles
+                partner = partner_of(contacts, n_obstacles, i, q)
+                for r in range(last - first):
+                    row = r if robot[first + r] == other else row
+                if partner < 0 or row < o or (row == o and partner < q):
+                    continue  # counted from its other side
+            pressing.side[m, 0], pressing.side[m, 1] = i, q
+            pressing.side[m, 2], pressing.side[m, 3] = other, partner
+            if other < 0:
+                slip = _measure_obstacle(i, contact, all_of_it, stack, wall, pressing.curved[m])
+                mu, soft, slides = surfaces.friction[k], surfaces.compliance[k], all_of_it.motion.slides[i]
+            else:
+                slip = _measure_rods(
+                    i, contact, other, contacts.contact[other, partner], all_of_it.motion, pressing.curved[m]
+                )
+                mu, soft = all_of_it.rods.friction, all_of_it.rods.compliance
+                slides = all_of_it.motion.slides[i] and all_of_it.motion.slides[other]
+            n_axis = normal_of(contact)
+            t1, t2 = tangents(n_axis)
+            axes, law = pressing.axes[m], pressing.law[m]
+            held = (contact.held[0], contact.held[1], contact.held[2])
+            for a in range(3):
+                axes[0, a], axes[1, a], axes[2, a] = n_axis[a], t1[a], t2[a]
+            pressing.free[m, 0], pressing.free[m, 1], pressing.free[m, 2] = (
+                contact.gap,
+                dot(slip, t1),
+                dot(slip, t2),
+            )
+            law[0], law[1] = mu if slides else 0.0, SOFT + soft
+            law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
+            _along_axes(axes, pressing.curved[m])
+            for r in range(3):
+                for a in range(most):
+                    pressing.along[m, r, a] = 0.0
+            _add_motion(m, o, i, q, 1.0, all_of_it, pressing)
+            if other >= 0:
+                _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
+            elif surfaces.mobility[k, 0] > 0.0:
+                at = (last - first) * n_q + 6 * surfaces.body[k]
+                place, _ = _place(i, contact.arclength, all_of_it.motion)
+                _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
+            force = contact.force
+            for r in range(3):
+                pressed = axes[r, 0] * force[0] + axes[r, 1] * force[1] + axes[r, 2] * force[2]
+                for a in range(n):
+                    pressing.gradient[a] += pressed * pressing.along[m, r, a]
+            m += 1
+    for k in range(n_obstacles if most > n else 0):
+        mobility, at = surfaces.mobility[k], n + 6 * surfaces.body[k]
+        if mobility[0] > 0.0:
+            for a in range(3):
+                pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)
+                for b in range(3):
+                    pressing.hessian[at + 3 + a, at + 3 + b] = mobility[1 + 3 * a + b] / all_of_it.yielding
+    for a in range(n, most):
+        if pressing.hessian[a, a] == 0.0:  # what cannot move
+            pressing.hessian[a, a] = 1.0
+    return m, most
+
+
+@kernel
+def _along_axes(axes: Floats, curved: Floats) -> None:
+    """A symmetric matrix of the world becomes one along the axes."""
+    one, two, three = _axis(axes, 0), _axis(axes, 1), _axis(axes, 2)
+    for r in range(3):
+        row = (curved[r, 0], curved[r, 1], curved[r, 2])
+        curved[r, 0], curved[r, 1], curved[r, 2] = dot(row, one), dot(row, two), dot(row, three)
+    for c in range(3):
+        column = (curved[0, c], curved[1, c], curved[2, c])
+        curved[0, c], curved[1, c], curved[2, c] = dot(column, one), dot(column, two), dot(column, three)
 
 
 @inline
-def _moved(along: Floats, free: Floats, step: Floats) -> Vec:
+def _moved(n: int, along: Floats, free: Floats, step: Floats) -> Vec:
     """u after a step."""
     u, v, w = free[0], free[1], free[2]
-    for a in range(len(step)):
+    for a in range(n):
         u += along[0, a] * step[a]
         v += along[1, a] * step[a]
         w += along[2, a] * step[a]
@@ -162,148 +331,148 @@ def _slope(mu: float, y: Vec, r: int, c: int) -> float:
 
 
 @kernel
-def _slope_along(n: int, pressing: Pressing, at: Floats, step: Floats) -> float:
+def _slope_along(m: int, n: int, pressing: Pressing, at: Floats, step: Floats) -> float:
     """Slope of the potential along a step, where the unknowns have changed by `at`."""
-    total, n_q = 0.0, len(step)
-    for a in range(n_q):
-        value = pressing.room[2, a]
-        for c in range(n_q):
+    total = 0.0
+    for a in range(n):
+        value = pressing.gradient[a]
+        for c in range(n):
             value += pressing.hessian[a, c] * at[c]
         total += value * step[a]
-    for k in range(n):
+    for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
-        force, _ = in_cone(law[0], _asked(law, _moved(along, pressing.free[k], at)))
+        force, _ = in_cone(law[0], _asked(law, _moved(n, along, pressing.free[k], at)))
         for r in range(3):
             if force[r] != 0.0:
                 moved = 0.0
-                for a in range(n_q):
+                for a in range(n):
                     moved += along[r, a] * step[a]
                 total -= force[r] * moved
     return total
 
 
 @kernel
-def _newton_step(n: int, pressing: Pressing, to: Floats) -> bool:
+def _newton_step(m: int, n: int, pressing: Pressing, to: Floats) -> bool:
     """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive; the diagonal
     stands for one that is not."""
-    m, n_q, step, good = pressing.matrix, len(to), pressing.step, True
-    for a in range(n_q):
-        value = pressing.room[2, a]
-        for c in range(n_q):
-            m[a, c] = pressing.hessian[a, c]
-            value += m[a, c] * step[c]
+    l, step, good = pressing.matrix, pressing.step, True  # noqa: E741
+    for a in range(n):
+        value = pressing.gradient[a]
+        for c in range(n):
+            l[a, c] = pressing.hessian[a, c]
+            value += l[a, c] * step[c]
         to[a] = -value
-    for k in range(n):
+    for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
-        y = _asked(law, _moved(along, pressing.free[k], step))
+        y = _asked(law, _moved(n, along, pressing.free[k], step))
         force, _ = in_cone(law[0], y)
         for r in range(3):
-            for a in range(n_q if force[r] != 0.0 else 0):
+            for a in range(n if force[r] != 0.0 else 0):
                 to[a] += along[r, a] * force[r]
             for s in range(3):
                 d = _slope(law[0], y, r, s) / law[1]
                 if d != 0.0:
-                    for a in range(n_q):
+                    for a in range(n):
                         part = d * along[r, a]
-                        for c in range(a + 1):
-                            m[a, c] += part * along[s, c]
-    for j in range(n_q):
-        pivot = m[j, j]
+                        for c in range(a + 1 if part != 0.0 else 0):
+                            l[a, c] += part * along[s, c]
+    for j in range(n):
+        pivot = l[j, j]
         for k in range(j):
-            pivot -= m[j, k] * m[j, k]
-        if not pivot > _PIVOT * abs(m[j, j]):
-            pivot, good = abs(m[j, j]) + 1e-300, False
+            pivot -= l[j, k] * l[j, k]
+        if not pivot > _PIVOT * abs(l[j, j]):
+            pivot, good = abs(l[j, j]) + 1e-300, False
         inverse = 1.0 / math.sqrt(pivot)
-        m[j, j] = inverse
-        for a in range(j + 1, n_q):
-            value = m[a, j]
+        l[j, j] = inverse
+        for a in range(j + 1, n):
+            value = l[a, j]
             for k in range(j):
-                value -= m[a, k] * m[j, k]
-            m[a, j] = value * inverse
-    for a in range(n_q):
+                value -= l[a, k] * l[j, k]
+            l[a, j] = value * inverse
+    for a in range(n):
         for k in range(a):
-            to[a] -= m[a, k] * to[k]
-        to[a] *= m[a, a]
-    for b in range(n_q):
-        a = n_q - 1 - b
-        for k in range(a + 1, n_q):
-            to[a] -= m[k, a] * to[k]
-        to[a] *= m[a, a]
+            to[a] -= l[a, k] * to[k]
+        to[a] *= l[a, a]
+    for b in range(n):
+        a = n - 1 - b
+        for k in range(a + 1, n):
+            to[a] -= l[k, a] * to[k]
+        to[a] *= l[a, a]
     return good
 
 
 @kernel
-def _turn_forces(n: int, contacts: Records, pressing: Pressing, sign: float) -> bool:
+def _turn_forces(m: int, n: int, contacts: ContactSet, pressing: Pressing, sign: float) -> bool:
     """Take from the Hessian what the forces turn with their surfaces (`sign` 1), or give it back; whether
     there is any."""
-    n_q, some = len(pressing.step), False
-    for k in range(n):
-        axes, c, change = pressing.axes[k], pressing.curved[k], pressing.change[k]
-        force = contacts[k].force
+    some = False
+    for k in range(m):
+        axes, c, along = pressing.axes[k], pressing.curved[k], pressing.along[k]
+        force = contacts.contact[pressing.side[k, 0], pressing.side[k, 1]].force
         pressed = force[0] * axes[0, 0] + force[1] * axes[0, 1] + force[2] * axes[0, 2]
-        if not pressed > 0.0 or c[0, 0] + c[1, 1] + c[2, 2] == 0.0:
+        if not pressed > 0.0 or c[1, 1] + c[2, 2] == 0.0:
             continue
         some = True
-        for a in range(n_q):
-            for r in range(3):
-                turned = c[r, 0] * change[0, a] + c[r, 1] * change[1, a] + c[r, 2] * change[2, a]
-                turned *= sign * pressed
-                for b in range(n_q):
-                    pressing.hessian[a, b] -= turned * change[r, b]
+        for a in range(n):
+            for r in range(1, 3):
+                turned = sign * pressed * (c[r, 1] * along[1, a] + c[r, 2] * along[2, a])
+                for b in range(n if turned != 0.0 else 0):
+                    pressing.hessian[a, b] -= turned * along[r, b]
     return some
 
 
 @kernel
-def press(n: int, contacts: Records, pressing: Pressing, renew: bool) -> tuple[float, bool]:
-    """Step and forces of one robot with n contacts, which hold its `law` and `free`; the largest change of
-    an unknown, and whether a slip that the step was led by has changed, if it may be told anew."""
-    n_q, step, rest, trial = (len(pressing.step), pressing.step, pressing.room[2], pressing.room[1])
-    for a in range(n_q):
-        rest[a], step[a] = pressing.gradient[a], 0.0
-    for k in range(n):
-        axes, force = pressing.axes[k], contacts[k].force
-        for a in range(n_q):
-            x, y, z = pressing.change[k, 0, a], pressing.change[k, 1, a], pressing.change[k, 2, a]
-            rest[a] += x * force[0] + y * force[1] + z * force[2]
-            for r in range(3):
-                pressing.along[k, r, a] = axes[r, 0] * x + axes[r, 1] * y + axes[r, 2] * z
-    to, turned = pressing.room[0], _turn_forces(n, contacts, pressing, 1.0)
+def press(m: int, n: int, contacts: ContactSet, pressing: Pressing, renew: bool) -> bool:
+    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step was led by has
+    changed, if it may be told anew."""
+    step, to, trial = pressing.step, pressing.room[0], pressing.room[1]
+    for a in range(n):
+        step[a] = 0.0
+    turned = _turn_forces(m, n, contacts, pressing, 1.0)
     for _ in range(_ROUNDS):
-        if not _newton_step(n, pressing, to) and turned:
-            _turn_forces(n, contacts, pressing, -1.0)
+        if not _newton_step(m, n, pressing, to) and turned:
+            _turn_forces(m, n, contacts, pressing, -1.0)
             turned = False
-            _newton_step(n, pressing, to)
+            _newton_step(m, n, pressing, to)
         low, high, fraction = 0.0, 1.0, 1.0
-        first = abs(_slope_along(n, pressing, step, to))
+        first = abs(_slope_along(m, n, pressing, step, to))
         for _ in range(_HALVINGS):
-            for a in range(n_q):
+            for a in range(n):
                 trial[a] = step[a] + fraction * to[a]
-            slope = _slope_along(n, pressing, trial, to)
+            slope = _slope_along(m, n, pressing, trial, to)
             if abs(slope) <= _SHALLOW * first or (fraction == 1.0 and slope < 0.0):
                 break
             low, high = (fraction, high) if slope < 0.0 else (low, fraction)
             fraction = 0.5 * (low + high)
-        size = 0.0
-        for a in range(n_q):
+        size, largest = 0.0, 0.0
+        for a in range(n):
             step[a] += fraction * to[a]
-            size = max(size, abs(fraction * to[a]))
-        largest = 0.0
-        for a in range(n_q):
-            largest = max(largest, abs(step[a]))
+            size, largest = max(size, abs(fraction * to[a])), max(largest, abs(step[a]))
         if not size > _SMALL * max(1.0, largest):
             break
+    return _tell_forces(m, n, contacts, pressing, renew)
+
+
+@kernel
+def _tell_forces(m: int, n: int, contacts: ContactSet, pressing: Pressing, renew: bool) -> bool:
+    """Forces and slips after the step, to both sides of a contact; whether a slip has changed."""
     changed = False
-    for k in range(n):
-        contact, axes, law = contacts[k], pressing.axes[k], pressing.law[k]
-        u = _moved(pressing.along[k], pressing.free[k], step)
-        y = _asked(law, u)
+    for k in range(m):
+        axes, law, side = pressing.axes[k], pressing.law[k], pressing.side[k]
+        contact = contacts.contact[side[0], side[1]]
+        y = _asked(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
         if renew and law[0] * abs(slid - contact.slid) > _RENEWED:
             contact.slid, changed = slid, True
         for a in range(3):
             contact.force[a] = force[0] * axes[0, a] + force[1] * axes[1, a] + force[2] * axes[2, a]
-    return largest, changed
+        if side[2] >= 0:
+            partner = contacts.contact[side[2], side[3]]
+            partner.slid = contact.slid
+            for a in range(3):
+                partner.force[a] = -contact.force[a]
+    return changed
 
 
 @kernel
