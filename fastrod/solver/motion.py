@@ -13,7 +13,6 @@ from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.motion import ModalMotion
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
-from fastrod.solver.balances import Event, copied_acting
 from fastrod.solver.boundary import new_shape
 from fastrod.solver.inputs import Inputs, arclengths
 from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, no_hosts
@@ -22,7 +21,7 @@ from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.state import MOVING, Pose, State, check_on_robot
 from fastrod.solver.stepper import PassShapes, TimeStepper, copied
-from fastrod.solver.tape import Tape
+from fastrod.solver.tape import Event, Tape, copied_acting
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 _TOLERANCE = 1e-9  # m: of the rest from which a motion starts

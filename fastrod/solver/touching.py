@@ -16,7 +16,7 @@ import numpy as np
 
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended, longest_move
-from fastrod.errors import InputError, Problem
+from fastrod.errors import InputError, Problem, ProblemSentence
 from fastrod.kernels.contact.problem import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
@@ -39,7 +39,7 @@ _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step is led by are told anew
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
-_SHORTEST = 4.0**-4  # of a step
+_DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
 _AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
 _MOST_STEPS, _GROWS, _LONGEST, _GIVEN_UP = 400, 2.0, 1.0, 1e-9  # steps to a rest, and their length [s]
@@ -64,6 +64,7 @@ class TouchingRods(ModalRods):
         if time.scheme == GENERALIZED_ALPHA:
             self.stepper.time = time._replace(scheme=BDF2)
         self._passes = np.zeros(self.n_robots, np.int64)
+        self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
     def replace(self, robots: Sequence[Robot]) -> None:
         """Take other robots of the same layout; a recording ends."""
@@ -123,9 +124,15 @@ class TouchingRods(ModalRods):
         self.engine.accept(rows[ok[rows]], found.shape)
         self.engine.end_step(ok.astype(float))
         solved = self._solved(found, ok, acting.ports)
-        passes = np.where(ok, np.maximum(self._passes, 1), -1)
-        reason = "contact in motion" if self.dynamics else "contact"
-        return solved._replace(passes=passes, reason=reason, kind=Problem.CONTACT_STUCK)
+        passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
+        for i in map(int, rows[~ok[rows]]):
+            inside = f"would be {self._deep[i]:.2g} m inside of what it touches"
+            what = inside if self._deep[i] > _INSIDE else "finds no balance"
+            parts = f"in {4**_DIVISIONS} parts, too, the rod {what}"
+            problems[i] = ProblemSentence(
+                f"contact: {parts}; come there in smaller changes.", Problem.CONTACT_STUCK
+            )
+        return solved._replace(passes=passes, problems=problems, kind=Problem.CONTACT_STUCK)
 
     def _mask(self, rows: Ints) -> Flags:
         return np.isin(np.arange(self.n_robots), rows)
@@ -198,7 +205,7 @@ class TouchingRods(ModalRods):
         left = lost = rows[~ok[rows]]
         self._go_back(lost, contacts)
         self._measure_anew(lost)
-        if not len(lost) or last - first < 1.5 * _SHORTEST:
+        if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
         before = engine.before
         for k in range(4):
@@ -241,7 +248,7 @@ class TouchingRods(ModalRods):
         """(n_robots,) who moved on in one step: those in whose world Newton's method has ended."""
         engine, modal, n, motion = self.engine, self.modal, self.n_robots, self.modal.motion
         contacts, q, left = engine.contact_set, motion.q + how.dt * motion.rate, rows
-        size, deep, ok = np.full(n, np.inf), np.zeros(n), np.zeros(n, bool)
+        size, deep, ok = np.full(n, np.inf), self._deep, np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
         for count in range(_PASSES + 1):
