@@ -43,7 +43,7 @@ def _rod() -> Iterator[None]:
 
 
 def _contact() -> Iterator[None]:
-    """A rod on a bar, alone and in a batch."""
+    """A rod on a bar, alone and in a batch, at rest and in motion."""
     robot = load_robot("prototype")
     bar = cylinder(0.01, 0.2, name="bar", position=(0.018, 0, 0.05), quaternion=(0.5**0.5, 0.5**0.5, 0, 0))
     scene = ContactScene(obstacles=[bar], rod_radius=0.003)
@@ -52,6 +52,12 @@ def _contact() -> Iterator[None]:
         for pull in np.linspace(0.0, 0.006, 20):
             sim.step(robot.rest_tendon_length + pull * _PULL)
         yield
+    heavy = replace(robot, segments=tuple(replace(s, line_density=0.05) for s in robot.segments))
+    sim = Simulator(heavy, points_per_segment=5, contact=scene, dynamics=True)
+    sim.settle(robot.rest_tendon_length)
+    for pull in np.linspace(0.0, 0.006, 20):
+        sim.step(robot.rest_tendon_length + pull * _PULL)
+    yield
 
 
 def _modes() -> Iterator[None]:
@@ -66,10 +72,10 @@ def _modes() -> Iterator[None]:
 
 GROUPS: Mapping[str, tuple[Callable[[], Iterator[None]], int]] = {
     "rod": (_rod, 3),
-    "contact": (_contact, 2),
+    "contact": (_contact, 3),
     "modes": (_modes, 2),
 }
-"""Kernels of each group, and its number of steps; contact also compiles what it needs of the rod."""
+"""Kernels of each group, and its number of steps; contact also compiles what it needs of the others."""
 
 
 def warm_up(groups: Sequence[str] = (), progress: Progress | None = None) -> None:

@@ -42,7 +42,8 @@ _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
 _AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
-_MOST_STEPS, _GROWS, _LONGEST, _GIVEN_UP = 400, 2.0, 1.0, 1e-9  # steps to a rest, and their length [s]
+_MOST_STEPS, _GROWS = 400, 4.0  # to a rest, and by how much they grow
+_FIRST, _LONGEST, _GIVEN_UP = 1e-3, 1.0, 1e-9  # s: their lengths
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
@@ -156,7 +157,7 @@ class TouchingRods(ModalRods):
             clear &= ~engine.whole_worlds(engine.overlap(np.flatnonzero(clear), found.shape))
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
             still = still[clear[still] | ~cold[still]]
-        size, tried = np.where(cold | self.dynamics, self.stepper.time.dt, _LONGEST), still
+        size, tried = np.full(self.n_robots, _FIRST), still
         for _ in range(_MOST_STEPS if len(still) else 0):
             for each in np.unique(size[still]):
                 some = still[size[still] == each]
@@ -173,6 +174,12 @@ class TouchingRods(ModalRods):
                 break
         self._hold_up(tried)
         return ok
+
+    @property
+    def _is_rigid(self) -> bool:
+        """Whether nothing that the rods touch gives way."""
+        surfaces, rods = self.engine.surfaces, self.engine.rods
+        return not (surfaces.compliance.any() or surfaces.mobility[:, 0].any() or rods.compliance > 0.0)
 
     def _hold_up(self, rows: Ints) -> None:
         """Take the motion of these robots from them."""
@@ -262,6 +269,8 @@ class TouchingRods(ModalRods):
                 through = self._mask(left[n_found < 0])
             search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin)
             violations(worlds, search, engine.surfaces, near, n_found, deep)
+            if self._is_rigid:  # the whole rod, and not what its candidates show
+                np.maximum(deep, -engine.clearance.gap, out=deep)
             busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
             ok |= self._mask(left) & ~engine.whole_worlds(busy & self._mask(left))
             keep = ~ok[left]

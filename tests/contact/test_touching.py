@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod import Modal, Modes, Robot, Segment, Simulator, Tendon
-from fastrod.contact import ContactScene, Obstacle, box, cylinder, mesh, plane, sphere
+from fastrod.contact import ContactScene, Obstacle, cylinder, mesh, plane, sphere
 from fastrod.errors import InputError
 
 RADIUS, LENGTH, EI, DENSITY = 0.004, 0.1, 0.01, 0.05
@@ -190,22 +190,76 @@ def test_distances_by_fcl_give_the_same_motion(dt: float) -> None:
         assert_allclose(one, other, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"self_contact": True}, "leave out self_contact, worlds and free bodies"),
-        ({"worlds": (0, 0)}, "leave out self_contact, worlds and free bodies"),
-    ],
-)
-def test_what_is_not_felt_yet_is_refused(given: dict[str, Any], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        simulator(rod(), BALL, n=2, **given)
+def crossing(solver: str, dynamics: bool) -> Simulator:
+    """Two rods that cross, the second a little aside."""
+    density = DENSITY if dynamics else 0.0
+    first = rod(line_density=density)
+    across = replace(
+        first, base_position=(0.0085, -0.05, 0.07), base_quaternion=(0.5**0.5, -(0.5**0.5), 0, 0)
+    )
+    scene = ContactScene(worlds=[0, 0], rod_radius=RADIUS)
+    given: Any = Modal(dynamics=True, modes=Modes(6, 4, pieces=2)) if dynamics else solver
+    return Simulator([first, across], dt=1e-3, solver=given, contact=scene)
 
 
-def test_rods_of_modes_at_rest_feel_nothing_and_say_so() -> None:
-    scene = ContactScene(obstacles=[box((0.01, 0.01, 0.01), name="box", position=(0.05, 0.0, 0.05))])
-    with pytest.raises(InputError, match="take dynamics=True, solver='observer'"):
-        Simulator(rod(), solver="modal", contact=scene)
+@pytest.mark.study
+@pytest.mark.parametrize("dynamics", [True, False])
+def test_two_rods_press_on_each_other_as_those_of_the_observer_do(dynamics: bool) -> None:
+    force = np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    found = []
+    for sim in (crossing("observer", False), crossing("modal", dynamics)):
+        for part in np.linspace(0.0, 1.0, 12):
+            state = sim.settle(tip_force=part * force)
+            assert state.ok.all(), state.problems
+        assert state.contacts.in_contact().all()
+        assert_allclose(state.contacts.total_force.sum(0), 0.0, atol=1e-9)
+        found.append((state.contacts.total_force, state.tip_position))
+    (one, tip), (other, tip_other) = found
+    assert_allclose(one, other, atol=2e-3 * np.abs(one).max())
+    assert_allclose(tip, tip_other, atol=2e-5)
+
+
+def struck(dt: float, mass: float = 0.01) -> float:
+    """Velocity of a free ball after the tip of a rod has hit it [m/s]."""
+    ball = sphere(0.01, name="ball", position=(0.02, 0.0, 0.095))
+    sim = simulator(rod(damping_time=5e-4), ball, dt=dt)
+    sim.settle(tip_force=(-0.4, 0.0, 0.0))
+    place, velocity = np.array([0.02, 0.0, 0.095]), np.zeros(3)
+    for _ in range(round(0.05 / dt)):
+        ahead = place + dt * velocity
+        sim.set_free("ball", dt * dt / mass, np.zeros((3, 3)), ahead)
+        state = sim.step(obstacle_pose={"ball": (*ahead, 1.0, 0.0, 0.0, 0.0)})
+        assert state.ok.all(), state.problems
+        velocity = velocity + dt / mass * state.contacts.wrench[0, 0, :3]
+        place = place + dt * velocity
+    return float(velocity[0])
+
+
+@pytest.mark.study
+def test_a_rod_that_is_let_go_throws_a_free_ball_to_first_order_in_the_step() -> None:
+    thrown = np.array([struck(dt) for dt in (1e-3, 5e-4, 2.5e-4)])
+    gained = np.diff(thrown)
+    assert 0.1 < thrown[-1] < 0.2
+    assert 1.5 < gained[0] / gained[1] < 2.6
+
+
+@pytest.mark.study
+def test_at_rest_modes_and_observer_bear_alike() -> None:
+    found = []
+    for solver in ("observer", "modal"):
+        robot = rod(line_density=0.0)
+        scene = ContactScene(obstacles=[replace(BALL, friction=0.0)], rod_radius=RADIUS)
+        sim = Simulator(robot, solver=solver, contact=scene)  # type: ignore[arg-type]
+        for part in np.linspace(0.0, 1.0, 9):
+            state = sim.step(tip_force=(0.4 * part, 0.05 * part, 0.0))
+            assert state.ok.all(), state.problems
+        found.append((state.tip_position, state.contacts.total_force))
+    (tip, force), (tip_other, force_other) = found
+    assert_allclose(tip, tip_other, atol=1e-5)
+    assert_allclose(force, force_other, atol=2e-3 * np.abs(force).max())
+
+
+def test_what_goes_with_no_contact_is_refused() -> None:
     sim = simulator(rod(), BALL)
     sim.settle()
     with pytest.raises(InputError, match="estimate_error was given with a contact scene"):
