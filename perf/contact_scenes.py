@@ -254,12 +254,14 @@ class Played:
 
 
 def with_mass(robot: Robot) -> Robot:
-    """A robot that can move: what has no mass gets one, and some damping."""
+    """A robot that can move: what has no mass gets one, no weight, and some damping; it begins where the
+    scene is clear of it."""
+    light = any(s.line_density == 0.0 for s in robot.segments)
     segments = (
         replace(s, line_density=s.line_density or 0.05, damping_time=s.damping_time or 5e-3)
         for s in robot.segments
     )
-    return replace(robot, segments=tuple(segments))
+    return replace(robot, segments=tuple(segments), gravity=(0.0, 0.0, 0.0) if light else robot.gravity)
 
 
 def play(batch: Batch, rows: list[int] | None = None, *, dt: float = 0.0, **options: Any) -> Played:

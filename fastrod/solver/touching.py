@@ -42,7 +42,7 @@ _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
 _AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
-_MOST_STEPS, _GROWS = 400, 4.0  # to a rest, and by how much they grow
+_MOST_STEPS, _GROWS = 100, 4.0  # to a rest, and by how much they grow
 _FIRST, _LONGEST, _GIVEN_UP = 1e-3, 1.0, 1e-9  # s: their lengths
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 

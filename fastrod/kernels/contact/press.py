@@ -186,6 +186,16 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: Pressing
 
 
 @kernel
+def _body_of(k: int, surfaces: Surfaces) -> int:
+    """Number of the first obstacle of the body that obstacle k is part of: the numbers of bodies are the
+    user's."""
+    first = k
+    for other in range(k - 1, -1, -1):
+        first = other if surfaces.body[other] == surfaces.body[k] else first
+    return first
+
+
+@kernel
 def gather_world(
     first: int, last: int, robot: Ints, all_of_it: Touching, pressing: Pressing, stack: Numbers, wall: Records
 ) -> tuple[int, int]:
@@ -249,7 +259,7 @@ def gather_world(
             if other >= 0:
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
             elif surfaces.mobility[k, 0] > 0.0:
-                at = (last - first) * n_q + 6 * surfaces.body[k]
+                at = n + 6 * _body_of(k, surfaces)
                 place, _ = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
             force = contact.force
@@ -259,7 +269,7 @@ def gather_world(
                     pressing.gradient[a] += pressed * pressing.along[m, r, a]
             m += 1
     for k in range(n_obstacles if most > n else 0):
-        mobility, at = surfaces.mobility[k], n + 6 * surfaces.body[k]
+        mobility, at = surfaces.mobility[k], n + 6 * _body_of(k, surfaces)
         if mobility[0] > 0.0:
             for a in range(3):
                 pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)
