@@ -91,8 +91,8 @@ def test_a_bar_that_moves_takes_the_rod_along() -> None:
         return {"bar": (x, 0.0, at, *ACROSS)}
 
     assert sim.settle(obstacle_pose=pose(-0.01)).ok.all()
-    for k in range(500):
-        state = sim.step(obstacle_pose=pose(-0.01 + 1e-5 * min(k, 300)))
+    for k in range(220):
+        state = sim.step(obstacle_pose=pose(-0.01 + 3e-5 * min(k, 100)))
         assert state.ok.all()
     bend = -0.007 + 0.005 + RADIUS
     where = state.contacts.arclength[0, 0]

@@ -134,7 +134,7 @@ def test_every_law_of_the_library_has_what_it_had() -> None:
     assert {name for name in effect_names() if trait(get_effect(name), "frequent")} == frequent
     pairs = [(name, other) for name in effect_names() for other in trait(get_effect(name), "separated_by")]
     assert all(other in effect_names() for _, other in pairs)
-    assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 40
+    assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 46
 
 
 def test_a_class_of_no_base_has_the_same_defaults() -> None:
