@@ -216,6 +216,7 @@ CONTACT = _record(
     ("damped_stiffness", np.float64),
     ("held", np.float64, (3,)),
     ("slid", np.float64),
+    ("place", np.float64, (3,)),
     ("matched", np.bool_),
 )
 """One contact of a rod. obstacle: its index, from n_obstacles on a rod's; partner: number that both sides of
@@ -223,8 +224,9 @@ a contact between rods share, or -1; arclength [m]; normal: toward the rod, worl
 rod, world [N]; radius: of the rod there [m]; arm: how far below the centreline the force acts, the radius
 where there is friction, else 0, for a normal force has no moment [m]; shift: how far it moved along the
 rod the last time [m]; damped_stiffness: what damping was based on last [N/m]; of a rod in motion held: the
-part of the force along the surface at the last step's end, world [N], and slid: how far it has slipped in
-this one [m]; matched: a candidate of this iteration belongs to it."""
+part of the force along the surface at the last step's end, world [N], slid: how far it has slipped in this
+one [m], and place: of the centreline when it was measured last, world [m]; matched: a candidate of this
+iteration belongs to it."""
 
 CANDIDATE = _record(
     ("obstacle", np.int64), ("arclength", np.float64), ("gap", np.float64), ("normal", np.float64, (3,))

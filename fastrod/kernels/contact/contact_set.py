@@ -80,6 +80,7 @@ def open_contact(
     contact.arm, contact.shift, contact.damped_stiffness = radius if friction > 0.0 else 0.0, FAR, 0.0
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
     contact.held[0], contact.held[1], contact.held[2], contact.slid = 0.0, 0.0, 0.0, 0.0
+    contact.place[0], contact.place[1], contact.place[2] = FAR, FAR, FAR
     contact.matched = False
 
 

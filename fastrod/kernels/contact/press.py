@@ -26,7 +26,7 @@ from ..vec import Vec, axpy, cross, dot, scale, sub
 from .assemble import tangents
 from .bvh import Numbers, Record, normal_of
 from .centreline import curve_of, curve_slip, interval_of, point_at
-from .contact_set import set_normal, wall_at
+from .contact_set import carries, set_normal, wall_at
 from .rod_proximity import partner_of
 from .surface import surface_curvature
 from .tunnelling import carried
@@ -37,6 +37,7 @@ _ROUNDS, _HALVINGS = 40, 40
 _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
+_TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
 _RENEWED = 5e-6  # m: a slip that changes by less is not told to the next pass
 
 
@@ -105,6 +106,13 @@ def _place_before(i: int, s: float, near: int, motion: ContactMotion) -> Vec:
     return point_at(before, j, fraction)
 
 
+@inline
+def _jumps(n: Vec, old: Vec, moved: Vec, d: float) -> bool:
+    """A normal has turned by more than a place at this distance from an edge turns it as it moves."""
+    turned = math.sqrt(max(2.0 - 2.0 * dot(n, old), 0.0))
+    return turned > _TURNED and turned * max(d, 0.0) > _FASTER * math.sqrt(dot(moved, moved))
+
+
 @kernel
 def _measure_obstacle(
     i: int, contact: Record, all_of_it: Touching, stack: Numbers, wall: Records, curved: Floats
@@ -115,10 +123,16 @@ def _measure_obstacle(
     p, j = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
     margin = motion.margin * all_of_it.rods.length[i]
-    d, n = wall_at(k, frame, p, normal_of(contact), margin, surfaces, stack, wall)
-    contact.gap = d - contact.radius
-    set_normal(contact, n)
+    old, last = normal_of(contact), (contact.place[0], contact.place[1], contact.place[2])
+    d, n = wall_at(k, frame, p, old, margin, surfaces, stack, wall)
     first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
+    contact.place[0], contact.place[1], contact.place[2] = p
+    if carries(contact) and _jumps(n, old, sub(p, last), d):
+        # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
+        n, contact.gap, d = old, contact.gap + dot(old, sub(p, last)), 0.0
+    else:
+        contact.gap = d - contact.radius
+    set_normal(contact, n)
     if d > 0.0:
         first, second, e = surface_curvature(k, frame, p, surfaces, stack)
     for a in range(3):
