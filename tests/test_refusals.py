@@ -283,10 +283,6 @@ MOTION: Rows = [
         lambda: Simulator(rod(), modes=Modes(4, 2)),
         "no input 'modes'; it is one of the solver: solver=fastrod.Modal",
     ),
-    (
-        lambda: moving(contact=scene()),
-        "^contact was given with rods of modes, which feel none yet; take solver",
-    ),
     (lambda: moving(solver=Observer()), "^dynamics was given beside a solver; give solver=fastrod.Modal"),
     (lambda: moving(solver=Modal(), dynamics=False, scheme="bdf2"), "^scheme was given beside a solver"),
     *(

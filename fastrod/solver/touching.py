@@ -65,6 +65,8 @@ class TouchingRods(ModalRods):
         if time.scheme == GENERALIZED_ALPHA:
             self.stepper.time = time._replace(scheme=BDF2)
         self._passes = np.zeros(self.n_robots, np.int64)
+        self._blocked = np.zeros(self.n_robots, bool)  # by what they touch, before they begin
+        self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
     def replace(self, robots: Sequence[Robot]) -> None:
@@ -117,7 +119,7 @@ class TouchingRods(ModalRods):
 
     def _begin(self, acting: Acting) -> PassShapes:
         self._take(acting)
-        self._passes[:] = 0
+        self._passes[:], self._blocked[:], self._nearest = 0, False, {}
         return self._room(True)
 
     def _end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting) -> Solved:
@@ -127,12 +129,17 @@ class TouchingRods(ModalRods):
         solved = self._solved(found, ok, acting.ports)
         passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
         for i in map(int, rows[~ok[rows]]):
-            inside = f"would be {self._deep[i]:.2g} m inside of what it touches"
+            k, s = self._nearest.get(i, (-1, 0.0))
+            names = self.engine.scene.names
+            where = f" with {names[k]!r} at arclength {s:.3g} m" if 0 <= k < len(names) else ""
+            inside = f"would be {self._deep[i]:.2g} m inside"
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
-            parts = f"in {4**_DIVISIONS} parts, too, the rod {what}"
-            problems[i] = ProblemSentence(
-                f"contact: {parts}; come there in smaller changes.", Problem.CONTACT_STUCK
-            )
+            said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
+            said, kind = f"{said}; come there in smaller changes.", Problem.CONTACT_STUCK
+            if self._blocked[i]:
+                said = "contact: neither the rod's rest nor its straight shape is clear; begin where it is."
+                kind = Problem.CONTACT_INSIDE
+            problems[i] = ProblemSentence(said, kind)
         return solved._replace(passes=passes, problems=problems, kind=Problem.CONTACT_STUCK)
 
     def _mask(self, rows: Ints) -> Flags:
@@ -156,6 +163,7 @@ class TouchingRods(ModalRods):
             clear = self._mask(fresh[self.stepper.rest(fresh, fresh, straight, found, _AT_REST)])
             clear &= ~engine.whole_worlds(engine.overlap(np.flatnonzero(clear), found.shape))
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
+            self._blocked[fresh[~clear[fresh]]] = True
             still = still[clear[still] | ~cold[still]]
         size, tried = np.full(self.n_robots, _FIRST), still
         for _ in range(_MOST_STEPS if len(still) else 0):
@@ -277,6 +285,7 @@ class TouchingRods(ModalRods):
             keep = ~ok[left]
             left, near, n_found = left[keep], near[keep], np.maximum(n_found[keep], 0)
             if not len(left) or count == _PASSES:
+                self._note_nearest(left, near, n_found)
                 break
             still, seen = count >= _MOVING, (engine.rods, engine.surfaces, world, contacts)
             renew_some(left, *seen, near, n_found, still)
@@ -299,6 +308,13 @@ class TouchingRods(ModalRods):
             end_some(arrived, contacts)
         modal.place_points(*acting.points, ports.extension)
         return ok
+
+    def _note_nearest(self, rows: Ints, near: Any, n_found: Ints) -> None:
+        """Note what robots without a balance were nearest to, for their sentence."""
+        for i, found, n in zip(map(int, rows), near, n_found, strict=True):
+            if n:
+                least = found[int(np.argmin(found["gap"][:n]))]
+                self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
     def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod import Modal, Modes, Robot, Segment, Simulator, Tendon
-from fastrod.contact import ContactScene, Obstacle, cylinder, mesh, plane, sphere
+from fastrod.contact import ContactScene, Obstacle, box, cylinder, mesh, plane, sphere
 from fastrod.errors import InputError
 
 RADIUS, LENGTH, EI, DENSITY = 0.004, 0.1, 0.01, 0.05
@@ -264,3 +264,18 @@ def test_what_goes_with_no_contact_is_refused() -> None:
     sim.settle()
     with pytest.raises(InputError, match="estimate_error was given with a contact scene"):
         sim.step(estimate_error=True)
+
+
+def test_what_stops_a_rod_is_said() -> None:
+    inside = simulator(rod(), box((0.05, 0.05, 0.05), name="block", position=(0.0, 0.0, 0.07)))
+    state = inside.settle()
+    assert state.problems[0] == (
+        "contact: neither the rod's rest nor its straight shape is clear; begin where it is."
+    )
+    aside = simulator(rod(), box((0.4, 0.4, 0.4), name="block", position=(0.3, 0.0, 0.0)))
+    aside.settle()
+    state = aside.step(obstacle_pose={"block": (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)})
+    assert not state.ok[0]
+    assert "contact with 'block' at arclength" in state.problems[0]
+    assert "come there in smaller changes." in state.problems[0]
+    assert aside.step(obstacle_pose={"block": (0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)}).ok.all()
