@@ -20,7 +20,7 @@ from fastrod.types import (
 from .contact.bvh import STACK
 from .contact.contact_set import violation
 from .contact.iteration import renew_contacts
-from .contact.press import Pressing, Touching, end_contacts, gather_world, press
+from .contact.press import PressedWorld, Touching, end_contacts, gather_world, press
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
 from .jit import entry
@@ -48,7 +48,7 @@ def renew_some(
 def violations(
     rows: ContactRows, search: RodSearch, surfaces: Surfaces, found: Records, n_found: Ints, worst: Floats
 ) -> None:
-    """How far each robot's world is beyond what its contacts hold [m]."""
+    """Write how far each robot's world is beyond what its contacts hold [m]."""
     for k in range(len(rows.start) - 1):
         first, last, deepest = rows.start[k], rows.start[k + 1], 0.0
         for r in range(first, last):
@@ -83,14 +83,14 @@ def press_some(
     step: Floats,
     changed: Flags,
 ) -> None:
-    """Step (n_robots, n_q) and forces of these worlds (`press`), and whose slips were told anew."""
+    """Step (n_robots, n_q) and forces of these worlds (`press`), and whose slips were renewed."""
     n_q, most, n_rows = gradient.shape[1], contacts.contact.shape[1], 0
     for k in range(len(start) - 1):
         n_rows = max(n_rows, start[k + 1] - start[k])
     n, m = n_rows * n_q + 6 * len(surfaces.primitive), n_rows * most
     if not surfaces.mobility.any():
         n = n_rows * n_q
-    pressing = Pressing(
+    pressing = PressedWorld(
         np.empty((n, n)),
         np.empty(n),
         np.empty((m, 4), np.int64),
@@ -107,10 +107,10 @@ def press_some(
     every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        told = press(count, unknowns, contacts, pressing, renew)
+        renewed = press(count, unknowns, contacts, pressing, renew)
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
-            changed[i] = told
+            changed[i] = renewed
             for a in range(n_q):
                 step[i, a] = pressing.step[o * n_q + a]
 

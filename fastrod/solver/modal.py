@@ -297,7 +297,7 @@ class ModalSolver:
         def run_some(some: Ints, work: ModalWork) -> None:
             pass_modes(self._run_of(some, how, jump, effort, remembers, given, ends), batch, output, work)
 
-        self._share_out(rows, run_some)
+        self._distribute(rows, run_some)
         # of what fades away each pass leaves less, in the end numbers below the normal ones: with these a
         # pass takes four times as long
         for array in self.motion[:3]:
@@ -411,10 +411,10 @@ class ModalSolver:
         def derive_some(some: Ints, work: ModalWork) -> None:
             derive_modes(self._run_of(some, how, jump, (0.0, 1, 1), REST), batch, q, work, found)
 
-        self._share_out(rows, derive_some)
+        self._distribute(rows, derive_some)
         return found
 
-    def _share_out(self, rows: Ints, run: Callable[[Ints, ModalWork], None]) -> None:
+    def _distribute(self, rows: Ints, run: Callable[[Ints, ModalWork], None]) -> None:
         """Call `run` with some of the rows and a workspace for these, on so many threads."""
         chunks = -(-len(rows) // LANES)
         tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)

@@ -106,10 +106,10 @@ class TouchingRods(ModalRods):
             free = warm[~pressed[warm]]
             ok[free] = stepper.advance(free, inputs, jump, found)
             self._passes[free] = np.abs(self.modal.iterations[free])
-            touch = pressed | engine.overlap(free[ok[free]], found.shape)
-            some = warm[touch[warm]]
+            meets = pressed | engine.overlap(free[ok[free]], found.shape)
+            some = warm[meets[warm]]
             _put(self.modal.motion, start, some)
-            ok[some] = self._touch(some, acting, inputs, (0.0, 1.0), found)[some]
+            ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
         return self._end(rows, ok, found, acting)
 
     def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
@@ -154,11 +154,11 @@ class TouchingRods(ModalRods):
         start, pressed, fresh = copied(modal.motion), engine.pressed(), rows[cold[rows]]
         free = rows[~pressed[rows]]
         ok[free] = self.stepper.rest(free, fresh, ports, found, min(tolerance, _AT_REST))
-        touch = engine.whole_worlds(pressed | (self._mask(free) & ~ok))
-        touch |= engine.overlap(free[~touch[free]], found.shape)
-        _put(modal.motion, start, still := rows[touch[rows]])
+        meets = engine.whole_worlds(pressed | (self._mask(free) & ~ok))
+        meets |= engine.overlap(free[~meets[free]], found.shape)
+        _put(modal.motion, start, still := rows[meets[rows]])
         ok[still] = False
-        if len(fresh := fresh[touch[fresh]]):  # from straight, where that is clear
+        if len(fresh := fresh[meets[fresh]]):  # from straight, where that is clear
             straight = unloaded(ports, modal.layout, modal.params)
             clear = self._mask(fresh[self.stepper.rest(fresh, fresh, straight, found, _AT_REST)])
             clear &= ~engine.whole_worlds(engine.overlap(np.flatnonzero(clear), found.shape))
@@ -171,7 +171,7 @@ class TouchingRods(ModalRods):
                 some = still[size[still] == each]
                 self._hold_up(some)
                 was = modal.motion.place.copy()
-                well = self._touch(some, acting, (ports, ports), (0.0, 1.0), found, float(each))
+                well = self._advance_pressed(some, acting, (ports, ports), (0.0, 1.0), found, float(each))
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
                 engine.place_at_once(well)
                 moved = np.abs(modal.motion.place - was).max(1) >= max(tolerance, _CREEPS)
@@ -198,7 +198,7 @@ class TouchingRods(ModalRods):
 
     # ------------------------------------------------------------ a step in contact
 
-    def _touch(
+    def _advance_pressed(
         self,
         rows: Ints,
         acting: Acting,
@@ -225,8 +225,8 @@ class TouchingRods(ModalRods):
             return ok
         before = engine.before
         for k in range(4):
-            part = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
-            left = left[self._touch(left, acting, inputs, part, found, length)[left]]
+            fraction = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
+            left = left[self._advance_pressed(left, acting, inputs, fraction, found, length)[left]]
             self._measure_anew(left)
             if k < 3:
                 engine.accept(left, found.shape, between_steps=True)
@@ -247,7 +247,7 @@ class TouchingRods(ModalRods):
             array[rows] = old[rows]
 
     def _measure_anew(self, rows: Ints) -> None:
-        """What is known of the distance of these robots holds for obstacles elsewhere on their way."""
+        """Lower what is known of the distance of these robots: the obstacles are elsewhere on their way."""
         engine = self.engine
         moved = longest_move(engine.poses_before, engine.poses, engine.surfaces.sphere)
         engine.clearance.distance[rows] -= np.broadcast_to(moved, self.n_robots)[rows, None]
@@ -319,13 +319,13 @@ class TouchingRods(ModalRods):
     def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""
         start, robot = self.engine.in_worlds(rows)[:2]
-        shares = np.array_split(np.arange(len(start) - 1), self.engine.thread_count(len(start) - 1))
+        batches = np.array_split(np.arange(len(start) - 1), self.engine.thread_count(len(start) - 1))
 
         def press(task: int) -> None:
-            some = shares[task]
+            some = batches[task]
             press_some(start[some[0] : some[-1] + 2], robot, *given)
 
-        in_threads(len(shares), press)
+        in_threads(len(batches), press)
 
     def _seen(
         self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[float, float]

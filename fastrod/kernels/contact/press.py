@@ -41,7 +41,7 @@ _TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by mor
 _RENEWED = 5e-6  # m: a slip that changes by less is not told to the next pass
 
 
-class Pressing(NamedTuple):
+class PressedWorld(NamedTuple):
     """The rods and free bodies of one world near their present unknowns, and room for its contacts."""
 
     hessian: Floats
@@ -173,7 +173,7 @@ def _measure_rods(
 
 @kernel
 def _add_motion(
-    m: int, row: int, i: int, q: int, sign: float, all_of_it: Touching, pressing: Pressing
+    m: int, row: int, i: int, q: int, sign: float, all_of_it: Touching, pressing: PressedWorld
 ) -> None:
     """Add the motion of point q of robot i, in this row of its world, to that of contact m."""
     change, axes, n_q = all_of_it.change[i, all_of_it.first + q], pressing.axes[m], all_of_it.change.shape[3]
@@ -184,7 +184,7 @@ def _add_motion(
 
 
 @kernel
-def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: Pressing) -> None:
+def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedWorld) -> None:
     """Take the motion of a free body there from that of contact m: displacement, and rotation by the moment
     on it, unknowns `at` on."""
     arm = sub(place, (mobility[10], mobility[11], mobility[12]))
@@ -201,7 +201,7 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: Pressing
 
 @kernel
 def _body_of(k: int, surfaces: Surfaces) -> int:
-    """Number of the first obstacle of the body that obstacle k is part of: the numbers of bodies are the
+    """Number of the first obstacle of the body that obstacle k is scaled of: the numbers of bodies are the
     user's."""
     first = k
     for other in range(k - 1, -1, -1):
@@ -211,7 +211,13 @@ def _body_of(k: int, surfaces: Surfaces) -> int:
 
 @kernel
 def gather_world(
-    first: int, last: int, robot: Ints, all_of_it: Touching, pressing: Pressing, stack: Numbers, wall: Records
+    first: int,
+    last: int,
+    robot: Ints,
+    all_of_it: Touching,
+    pressing: PressedWorld,
+    stack: Numbers,
+    wall: Records,
 ) -> tuple[int, int]:
     """The world in the rows `first` to `last` into `pressing`; how many contacts and unknowns it has."""
     n_q, surfaces, contacts = all_of_it.gradient.shape[1], all_of_it.surfaces, all_of_it.contacts
@@ -319,7 +325,7 @@ def _moved(n: int, along: Floats, free: Floats, step: Floats) -> Vec:
 
 
 @inline
-def _asked(law: Floats, u: Vec) -> Vec:
+def _requested(law: Floats, u: Vec) -> Vec:
     """y"""
     return -(u[0] + law[0] * law[4]) / law[1], law[2] - u[1] / law[1], law[3] - u[2] / law[1]
 
@@ -333,8 +339,8 @@ def in_cone(mu: float, y: Vec) -> tuple[Vec, float]:
     normal = (y[0] + mu * size) / (1.0 + mu * mu)
     if normal <= 0.0:
         return (0.0, 0.0, 0.0), size
-    part = mu * normal / size if size > 0.0 else 0.0
-    return (normal, part * y[1], part * y[2]), size
+    scaled = mu * normal / size if size > 0.0 else 0.0
+    return (normal, scaled * y[1], scaled * y[2]), size
 
 
 @inline
@@ -355,7 +361,7 @@ def _slope(mu: float, y: Vec, r: int, c: int) -> float:
 
 
 @kernel
-def _slope_along(m: int, n: int, pressing: Pressing, at: Floats, step: Floats) -> float:
+def _slope_along(m: int, n: int, pressing: PressedWorld, at: Floats, step: Floats) -> float:
     """Slope of the potential along a step, where the unknowns have changed by `at`."""
     total = 0.0
     for a in range(n):
@@ -365,7 +371,7 @@ def _slope_along(m: int, n: int, pressing: Pressing, at: Floats, step: Floats) -
         total += value * step[a]
     for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
-        force, _ = in_cone(law[0], _asked(law, _moved(n, along, pressing.free[k], at)))
+        force, _ = in_cone(law[0], _requested(law, _moved(n, along, pressing.free[k], at)))
         for r in range(3):
             if force[r] != 0.0:
                 moved = 0.0
@@ -376,7 +382,7 @@ def _slope_along(m: int, n: int, pressing: Pressing, at: Floats, step: Floats) -
 
 
 @kernel
-def _newton_step(m: int, n: int, pressing: Pressing, to: Floats) -> bool:
+def _newton_step(m: int, n: int, pressing: PressedWorld, to: Floats) -> bool:
     """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive; the diagonal
     stands for one that is not."""
     l, step, good = pressing.matrix, pressing.step, True  # noqa: E741
@@ -388,7 +394,7 @@ def _newton_step(m: int, n: int, pressing: Pressing, to: Floats) -> bool:
         to[a] = -value
     for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
-        y = _asked(law, _moved(n, along, pressing.free[k], step))
+        y = _requested(law, _moved(n, along, pressing.free[k], step))
         force, _ = in_cone(law[0], y)
         for r in range(3):
             for a in range(n if force[r] != 0.0 else 0):
@@ -397,9 +403,9 @@ def _newton_step(m: int, n: int, pressing: Pressing, to: Floats) -> bool:
                 d = _slope(law[0], y, r, s) / law[1]
                 if d != 0.0:
                     for a in range(n):
-                        part = d * along[r, a]
-                        for c in range(a + 1 if part != 0.0 else 0):
-                            l[a, c] += part * along[s, c]
+                        scaled = d * along[r, a]
+                        for c in range(a + 1 if scaled != 0.0 else 0):
+                            l[a, c] += scaled * along[s, c]
     for j in range(n):
         pivot = l[j, j]
         for k in range(j):
@@ -426,7 +432,7 @@ def _newton_step(m: int, n: int, pressing: Pressing, to: Floats) -> bool:
 
 
 @kernel
-def _turn_forces(m: int, n: int, contacts: ContactSet, pressing: Pressing, sign: float) -> bool:
+def _rotate_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, sign: float) -> bool:
     """Take from the Hessian what the forces turn with their surfaces (`sign` 1), or give it back; whether
     there is any."""
     some = False
@@ -446,16 +452,16 @@ def _turn_forces(m: int, n: int, contacts: ContactSet, pressing: Pressing, sign:
 
 
 @kernel
-def press(m: int, n: int, contacts: ContactSet, pressing: Pressing, renew: bool) -> bool:
+def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
     """Step and forces of a world with m contacts and n unknowns; whether a slip that the step was led by has
     changed, if it may be told anew."""
     step, to, trial = pressing.step, pressing.room[0], pressing.room[1]
     for a in range(n):
         step[a] = 0.0
-    turned = _turn_forces(m, n, contacts, pressing, 1.0)
+    turned = _rotate_forces(m, n, contacts, pressing, 1.0)
     for _ in range(_ROUNDS):
         if not _newton_step(m, n, pressing, to) and turned:
-            _turn_forces(m, n, contacts, pressing, -1.0)
+            _rotate_forces(m, n, contacts, pressing, -1.0)
             turned = False
             _newton_step(m, n, pressing, to)
         low, high, fraction = 0.0, 1.0, 1.0
@@ -474,17 +480,17 @@ def press(m: int, n: int, contacts: ContactSet, pressing: Pressing, renew: bool)
             size, largest = max(size, abs(fraction * to[a])), max(largest, abs(step[a]))
         if not size > _SMALL * max(1.0, largest):
             break
-    return _tell_forces(m, n, contacts, pressing, renew)
+    return _report_forces(m, n, contacts, pressing, renew)
 
 
 @kernel
-def _tell_forces(m: int, n: int, contacts: ContactSet, pressing: Pressing, renew: bool) -> bool:
+def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
     """Forces and slips after the step, to both sides of a contact; whether a slip has changed."""
     changed = False
     for k in range(m):
         axes, law, side = pressing.axes[k], pressing.law[k], pressing.side[k]
         contact = contacts.contact[side[0], side[1]]
-        y = _asked(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
+        y = _requested(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
         if renew and law[0] * abs(slid - contact.slid) > _RENEWED:
