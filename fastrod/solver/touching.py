@@ -98,7 +98,7 @@ class TouchingRods(ModalRods):
         """Move these robots on by dt, or bring them to rest."""
         engine, stepper, before = self.engine, self.stepper, last.ports
         found, cold = self._begin(acting), engine.whole_worlds(self._mask(rows) & ~last.warm)
-        ok, warm = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, found, _AT_REST), rows
+        ok = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, found, _AT_REST)
         warm = rows[~cold[rows]] if self.dynamics and before is not None else rows[:0]
         if len(warm) and before is not None:
             start, inputs = copied(self.modal.motion), (before, acting.ports)
@@ -110,20 +110,20 @@ class TouchingRods(ModalRods):
             some = warm[meets[warm]]
             _put(self.modal.motion, start, some)
             ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
-        return self._end(rows, ok, found, acting)
+        return self._end(rows, ok, found, acting, last)
 
     def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
         """Bring these robots to rest, to `tolerance` [m] in a step of a second."""
         found, cold = self._begin(acting), self.engine.whole_worlds(self._mask(rows) & ~last.warm)
-        return self._end(rows, self._rest(rows, cold, acting, found, tolerance), found, acting)
+        return self._end(rows, self._rest(rows, cold, acting, found, tolerance), found, acting, last)
 
     def _begin(self, acting: Acting) -> PassShapes:
         self._take(acting)
         self._passes[:], self._blocked[:], self._nearest = 0, False, {}
         return self._room(True)
 
-    def _end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting) -> Solved:
-        """The state, with what has stopped those that are not ok."""
+    def _end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
+        """The state, with what has stopped those that are not ok; they go on from where they were."""
         self.engine.accept(rows[ok[rows]], found.shape)
         self.engine.end_step(ok.astype(float))
         solved = self._solved(found, ok, acting.ports)
@@ -140,7 +140,8 @@ class TouchingRods(ModalRods):
                 said = "contact: neither the rod's rest nor its straight shape is clear; begin where it is."
                 kind = Problem.CONTACT_INSIDE
             problems[i] = ProblemSentence(said, kind)
-        return solved._replace(passes=passes, problems=problems, kind=Problem.CONTACT_STUCK)
+        held = self._mask(rows) & ~ok & last.warm
+        return solved._replace(passes=passes, problems=problems, kind=Problem.CONTACT_STUCK, held=held)
 
     def _mask(self, rows: Ints) -> Flags:
         return np.isin(np.arange(self.n_robots), rows)
