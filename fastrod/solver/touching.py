@@ -38,6 +38,7 @@ _PASSES = 8
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step is led by are told anew
 _STILL = 1e-6  # rad: a Newton step below it is the last one
+_FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
@@ -220,7 +221,6 @@ class TouchingRods(ModalRods):
         ok = self._one(rows, acting, ports, Step(BDF1, (last - first) * whole), span, found)
         left = lost = rows[~ok[rows]]
         self._go_back(lost, contacts)
-        self._measure_anew(lost)
         # a step to a rest is taken again by who asks for it, shorter
         if not len(lost) or length is not None or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
@@ -246,6 +246,7 @@ class TouchingRods(ModalRods):
     def _go_back(self, rows: Ints, then: ContactSet) -> None:
         for array, old in zip(self.engine.contact_set, then, strict=True):
             array[rows] = old[rows]
+        self.engine.clearance.distance[rows] = -np.inf  # a try that failed has been anywhere
 
     def _measure_anew(self, rows: Ints) -> None:
         """Lower what is known of the distance of these robots: the obstacles are elsewhere on their way."""
@@ -300,7 +301,7 @@ class TouchingRods(ModalRods):
             q[left] += step[left]
             size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
             self._passes[left] += 1
-            lost = engine.whole_worlds(np.asarray(~np.isfinite(q).all(1)))
+            lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
             q[lost] = motion.q[lost]
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):

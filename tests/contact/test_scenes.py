@@ -40,6 +40,18 @@ def test_no_scene_is_deeper_than_it_says(scenes, seed, index, rows):
     assert len(played.sentences) == (~played.ok).sum()
 
 
+@pytest.mark.study
+@pytest.mark.parametrize("index", [44, 60, 99, 116])  # rings, a thin plate, a noisy sphere
+@pytest.mark.parametrize("dt", [2e-3, 1.5e-2])
+def test_no_scene_in_motion_is_deeper_than_it_says(scenes, index, dt):
+    played = scenes.play(scenes.make_batch(5, index), dt=dt)
+    assert played.touching.any()
+    assert np.nanmax(np.where(played.ok, played.depth, np.nan)) < 3e-5
+    assert played.ok.mean() > 0.9
+    assert all(said.startswith("contact") for said in played.sentences)
+    assert len(played.sentences) == (~played.ok).sum()
+
+
 @pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(
     ("index", "row"),
