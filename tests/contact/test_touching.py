@@ -264,6 +264,8 @@ def test_what_goes_with_no_contact_is_refused() -> None:
     sim.settle()
     with pytest.raises(InputError, match="estimate_error was given with a contact scene"):
         sim.step(estimate_error=True)
+    with pytest.raises(InputError, match="self_contact and rods of modes, which do not feel themselves"):
+        Simulator(rod(), dynamics=True, contact=ContactScene(self_contact=True))
 
 
 def test_what_stops_a_rod_is_said() -> None:
