@@ -36,7 +36,7 @@ from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, I
 
 _PASSES = 8
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
-_RENEWING = 2  # passes after which the slips that a step is led by are told anew
+_RENEWING = 2  # passes after which the slips that a step uses are updated
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches

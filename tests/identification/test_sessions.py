@@ -147,7 +147,8 @@ def test_another_day_has_tighter_tendons_and_its_load_hangs_elsewhere() -> None:
     tip = replay(log, replace(robot, effects=(tighter, beside))).tip_position
     log = replace(log, tip_position=tip + NOISE * np.random.default_rng(5).normal(size=(N, 3)))
     result = identify(log, robot, only_session=True, held_out=["@9:"])
-    assert result.test.after < 1.1 * np.sqrt(3.0) * NOISE < 0.2 * result.as_given_rms[1]  # type: ignore[index]
+    assert result.as_given_rms is not None
+    assert result.test.after < 1.1 * np.sqrt(3.0) * NOISE < 0.2 * result.as_given_rms[1]
     for table in (tighter, beside):
         for key in table.keys() - {"name"}:
             found = result.base_parameters[f"{table['name']}.{key}"]

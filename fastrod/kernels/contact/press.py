@@ -38,7 +38,7 @@ _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
 _TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
-_RENEWED = 5e-6  # m: a slip that changes by less is not told to the next pass
+_RENEWED = 5e-6  # m: a slip that changes by less is kept for the next pass
 
 
 class PressedWorld(NamedTuple):
@@ -453,8 +453,8 @@ def _rotate_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
 
 @kernel
 def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
-    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step was led by has
-    changed, if it may be told anew."""
+    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
+    changed, where it may (`renew`)."""
     step, to, trial = pressing.step, pressing.room[0], pressing.room[1]
     for a in range(n):
         step[a] = 0.0

@@ -189,6 +189,16 @@ def write_nodes(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, out
                 m += NODE_VECTORS
 
 
+@inline
+def _moved_by(a: int, p: int, place: Vec, row: Floats, w: int, batch: ModalBatch, work: ModalWork) -> Vec:
+    """Displacement of a place of piece p, whose row of the integration this is, by unknown a."""
+    before, c = a // work.end.shape[1], a % work.end.shape[1]
+    if before < p:
+        moved, _ = carried(before, c, place, w, work)
+        return moved
+    return displaced(p, c, row, w, batch.basis, work)
+
+
 @kernel
 def write_lumps(
     robots: Ints, n_robots: int, batch: ModalBatch, work: ModalWork, out: ModalDerivatives
@@ -209,11 +219,7 @@ def write_lumps(
                 mass = read(station, S_MASS, w)
                 scatter(out.inertia[i, m : m + 3], (mass, mass, mass))
                 for a in range((p + 1) * n_modes):
-                    before, c = a // n_modes, a % n_modes
-                    if before < p:
-                        moved, _ = carried(before, c, place, w, work)
-                    else:
-                        moved = displaced(p, c, row, w, batch.basis, work)
+                    moved = _moved_by(a, p, place, row, w, batch, work)
                     for f in range(3):
                         out.number_change[i, m + f, a] = moved[f]
                 m += 3
@@ -235,11 +241,7 @@ def write_points(
                 row[j] = read(station, S_ROW + j, w)
             scatter(out.point[i, q], place)
             for a in range((p + 1) * n_modes):
-                before, c = a // n_modes, a % n_modes
-                if before < p:
-                    moved, _ = carried(before, c, place, w, work)
-                else:
-                    moved = displaced(p, c, row, w, batch.basis, work)
+                moved = _moved_by(a, p, place, row, w, batch, work)
                 for f in range(3):
                     out.point_change[i, q, f, a] = moved[f]
 
