@@ -99,9 +99,11 @@ class Simulator(RobotBatch):
         if contact is not None:
             from fastrod.contact.engine import Engine
 
-            rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
+            rods = contact.rods(self.robots, self.n_robots, self._layout)
             self._engine = Engine(contact, rods, self._plain.length, self.n_points, shared["threads"])
             self._felt = self._engine if feel_contact else None
+        self.solver: SolverName = "modal" if isinstance(how, Modal) else "observer"
+        """Kind of the solver; among obstacles "observer" has rods of modes where they touch."""
         self._rods = self._solver_of(how, shared, recover)
 
     def _solver_of(self, how: Observer | Modal, shared: Any, recover: bool) -> Solver:
@@ -117,17 +119,12 @@ class Simulator(RobotBatch):
 
             return TouchingRods(self._felt, *robots, **shared)
         shared |= {"device": self.device, "recover": bool(recover)}
-        given = how, self._layout, self._plain, self.n_robots
+        given = self._layout, self._plain, self.n_robots
         if self._felt is None:
-            return ObserverSolver(*given, **shared)
-        from fastrod.solver.contact_solver import ContactObserver
+            return ObserverSolver(how, *given, **shared)
+        from fastrod.solver.resting import RestingRods
 
-        return ContactObserver(self._felt, *given, **shared)
-
-    @property
-    def solver(self) -> SolverName:
-        """Kind of the solver: "observer" or "modal"."""
-        return "observer" if isinstance(self._rods, ObserverSolver) else "modal"
+        return RestingRods(self._felt, how, self.robots, *given, **shared)
 
     def __repr__(self) -> str:
         touched = "" if self.contact is None else ", ".join(self.contact.names) or "rods alone"
@@ -364,7 +361,7 @@ class Simulator(RobotBatch):
         Between nodes the rod is integrated from the node before, so the answer has the integrator's order
         everywhere.
         """
-        if self.solver == "modal":
+        if self.solver == "modal" or self._felt is not None:
             from fastrod.solver.motion import pose_at
 
             return pose_at(self._full("shape"), arclength)

@@ -180,23 +180,6 @@ class Surfaces(NamedTuple):
     """(n_faces, 7, 3) pseudonormals of face, edges ab, bc, ca, corners a, b, c."""
 
 
-class PointLoads(NamedTuple):
-    """Contact points of the robots of one pass, in the order of its rows: loads in, linear response out.
-    Length 0 if none."""
-
-    node: Ints
-    """(n_rows, n_loads) node that the contact is on; -1 where there is none."""
-    force: Floats
-    """(n_rows, n_loads, 3) on the rod, world [N]."""
-    arm: Floats
-    """(n_rows, n_loads, 3) from the centreline to the point of contact, world [m]."""
-    motion: Floats
-    """(n_rows, 3 n_loads, 1 + 3 n_loads) motion of the contact points, world: first what closing the boundary
-    does at these forces [m], then the compliance [m/N]."""
-    unknown: Floats
-    """(n_rows, n_x, 1 + 3 n_loads) change of the boundary unknowns, in the same columns."""
-
-
 def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
     """A dtype whose elements have their fields as attributes, in Python as in a kernel. (No field may have
     the name of an attribute that numpy gives every element, such as `size`.)"""
@@ -211,9 +194,7 @@ CONTACT = _record(
     ("gap", np.float64),
     ("force", np.float64, (3,)),
     ("radius", np.float64),
-    ("arm", np.float64),
     ("shift", np.float64),
-    ("damped_stiffness", np.float64),
     ("held", np.float64, (3,)),
     ("slid", np.float64),
     ("place", np.float64, (3,)),
@@ -221,12 +202,10 @@ CONTACT = _record(
 )
 """One contact of a rod. obstacle: its index, from n_obstacles on a rod's; partner: number that both sides of
 a contact between rods share, or -1; arclength [m]; normal: toward the rod, world; gap [m]; force: on the
-rod, world [N]; radius: of the rod there [m]; arm: how far below the centreline the force acts, the radius
-where there is friction, else 0, for a normal force has no moment [m]; shift: how far it moved along the
-rod the last time [m]; damped_stiffness: what damping was based on last [N/m]; of a rod in motion held: the
-part of the force along the surface at the last step's end, world [N], slid: how far it has slipped in this
-one [m], and place: of the centreline when it was measured last, world [m]; matched: a candidate of this
-iteration belongs to it."""
+rod, world [N]; radius: of the rod there [m]; shift: how far it moved along the rod the last time [m]; held:
+the part of the force along the surface at the last step's end, world [N]; slid: how far it has slipped in
+this one [m]; place: of the centreline when it was measured last, world [m]; matched: a candidate of this
+pass belongs to it."""
 
 CANDIDATE = _record(
     ("obstacle", np.int64), ("arclength", np.float64), ("gap", np.float64), ("normal", np.float64, (3,))
@@ -238,17 +217,6 @@ WALL = _record(("distance", np.float64), ("normal", np.float64, (3,)), ("triangl
 
 SAMPLE = _record(("fraction", np.float64), ("distance", np.float64), ("slope", np.float64))
 """Signed distance of the centreline and its slope along the rod, at a fraction of an interval."""
-
-TROUBLE = _record(
-    ("cause", np.int64),
-    ("obstacle", np.int64),
-    ("arclength", np.float64),
-    ("distance", np.float64),
-    ("from_rest", np.float64),
-)
-"""Cause that keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle
-(from n_obstacles on a rod; -1: none), where [m], by how much [m], and how far its world is from rest: the
-largest of motion, residual and violation [m]."""
 
 
 class ContactRods(NamedTuple):
@@ -262,12 +230,6 @@ class ContactRods(NamedTuple):
     """(n_robots,) length of an integration step [m]."""
     length: Floats
     """(n_robots,) of the whole chain [m]."""
-    moment_scale: Floats
-    """(n_robots,) EI/l [N m]."""
-    tension_scale: Floats
-    """(n_robots,) EI/(d l) [N]."""
-    n_free: int
-    """Tendons whose tension is an unknown."""
     n_steps: int
     friction: float
     """Coulomb coefficient of rod on rod."""
@@ -295,19 +257,13 @@ class ContactMotion(NamedTuple):
     rotation: Floats
     curvature: Floats
     arclength: Floats
-    residual: Floats
-    """These five as in `RodShape`."""
+    """These four as in `RodShape`."""
     position_before: Floats
     rotation_before: Floats
     curvature_before: Floats
     arclength_before: Floats
-    """Cross-sections from which the rods have come, having met nothing since: the last step, or the last
-    pass of a damped iteration."""
-    position_slip: Floats
-    rotation_slip: Floats
-    curvature_slip: Floats
-    arclength_slip: Floats
-    """The shapes at the last step: what slip is counted from."""
+    """Cross-sections from which the rods have come, having met nothing since, and what slip is counted
+    from."""
     distance: Floats
     measured_at: Floats
     gap: Floats
@@ -317,12 +273,9 @@ class ContactMotion(NamedTuple):
     slides: Flags
     """(n_robots,) slip is counted from there; where not, friction is left out."""
     tolerance: float
-    """Motion, residual and violation below which a world is at rest [m]."""
+    """Violation that counts as none [m]."""
     margin: float
     """Gap below which a contact is watched, as a fraction of the rod's length."""
-    damping: Floats
-    """(n_robots,) 0, or how many times the largest geometric stiffness is held against the motion of its
-    point: where the plain iteration finds no rest, this one goes down in energy, slowly."""
 
 
 class ContactSet(NamedTuple):
@@ -348,19 +301,13 @@ class Clearance(NamedTuple):
 
 
 class ContactRows(NamedTuple):
-    """The robots of one contact iteration, world by world, and what comes of it."""
+    """Robots, world by world."""
 
     start: Ints
     """(n_worlds + 1,) first row of each world (the robots that may touch each other), with the end at
     last."""
     robot: Ints
     """(n_rows,) index of the robot."""
-    status: Ints
-    """(n_rows,) whether the row's world is at rest (`kernels.contact.iteration`)."""
-    trouble: Records
-    """(n_robots,) of `TROUBLE`."""
-    x: Floats
-    """(n_robots, n_x) boundary unknowns, `Memory.x`."""
 
 
 class SearchWork(NamedTuple):
@@ -379,60 +326,3 @@ class SearchWork(NamedTuple):
     """(n_samples,) of `SAMPLE`: the halves of one interval."""
     stack: Floats
     """Links of a mesh's hierarchy that wait (`kernels.contact.bvh`)."""
-
-
-class ContactProblem(NamedTuple):
-    """Workspace of the contact problem of one world: `m` contacts (both sides of one between rods are one),
-    `n` contact points (one for each side on a rod). In the arguments of a batch with an axis more at first,
-    one part of it a thread."""
-
-    first_point: Ints
-    """(n_rows,) first contact point of each row."""
-    point: Ints
-    """(m, 2) contact points of both sides; -1 is an obstacle."""
-    obstacle: Ints
-    """(m,) its index; -1 is a rod."""
-    place: Floats
-    """(m, 3) where the force acts, world [m]."""
-    axes: Floats
-    """(m, 3, 3) normal and two tangents, world."""
-    friction: Floats
-    """(m,) Coulomb coefficients."""
-    compliance: Floats
-    """(m,) depth per normal force [m/N]."""
-    free: Floats
-    """(3 m,) motion without contact forces, along each contact's axes [m]."""
-    delassus: Floats
-    """(3 m, 3 m) compliance between contacts, along their axes [m/N]."""
-    force: Floats
-    """(3 m,) along the axes [N]."""
-    turned: Floats
-    """(m, 3, 3) geometric stiffness: change of the force as its point moves, world [N/m]."""
-    stiffness: Floats
-    """(m,) the largest size of that [N/m]."""
-    applied: Floats
-    """(3 n,) forces of the pass on the contact points, world [N]."""
-    change: Floats
-    """(3 n,) forces sought less those [N]."""
-    model: Floats
-    """(3 n, 1 + 3 n) motion of the contact points as in `PointLoads.motion`, of all rows."""
-    system: Floats
-    """(3 n, 6 n + 1) linear equations and their right-hand sides."""
-    start: Floats
-    """(3 m,) forces before the law was solved [N]."""
-    state: Ints
-    """(m,) open, sticking or slipping."""
-    along: Floats
-    """(m, 2) direction of the friction where it slips."""
-    proposed: Floats
-    """(n_rows, n_loads, 3) what the law answers, world [N]."""
-    unknown: Floats
-    """(n_rows, n_x) change of the boundary unknowns."""
-    n_found: Ints
-    """(n_rows,) candidates of each row."""
-    found: Records
-    """(n_rows, n) of `CANDIDATE`."""
-    centre: Floats
-    """(max_contacts, 3) centreline at each contact of a robot, world [m]."""
-    wall: Records
-    """(n,) of `WALL`."""

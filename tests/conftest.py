@@ -56,7 +56,7 @@ def one_compilation() -> Iterator[None]:
     yield
     if numba.config.DISABLE_JIT:
         return
-    from fastrod.kernels import batch, contact_batch, modal_batch
+    from fastrod.kernels import batch, contact_batch, modal_batch, press_batch
     from fastrod.kernels.jit import OnThreads
     from fastrod.kernels.rod import cold
 
@@ -64,4 +64,5 @@ def one_compilation() -> Iterator[None]:
     large = {name: loop.one for name, loop in loops.items() if isinstance(loop, OnThreads)}
     large |= {"move_to_inputs": batch.move_to_inputs, "begin": cold.begin}
     large |= {"pass_modes": modal_batch.pass_modes, "derive_modes": modal_batch.derive_modes}
+    large |= {"press_some": press_batch.press_some}
     assert {name: len(one.signatures) for name, one in large.items() if len(one.signatures) > 1} == {}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fastrod.kernels import batch, contact_batch, modal_batch, notice
+from fastrod.kernels import batch, contact_batch, modal_batch, notice, press_batch
 
 SCRIPT = """
 import numpy as np
@@ -75,12 +75,12 @@ def listener(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) ->
 def test_each_group_of_large_kernels_has_one_line(
     listener: notice._Around, how_often: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    contact = contact_batch.search_some, contact_batch.iterate_some
+    contact = contact_batch.search_some, press_batch.press_some
     for kernel in (*contact, batch.pass_some, batch.place_all, modal_batch.pass_modes):
         listener.on_start(Compilation(kernel.py_func))  # type: ignore[union-attr]
         listener.on_end(None)
     listener.on_start(Compilation(os.getenv))  # somebody else's
-    groups = (notice.SECONDS[name] for name in ("iterate_some", "pass_some", "pass_modes"))
+    groups = (notice.SECONDS[name] for name in ("press_some", "pass_some", "pass_modes"))
     lines = [f"Compiling the kernels of {what}, about {seconds} s, {how_often}." for what, seconds in groups]
     assert capsys.readouterr().err.splitlines() == lines
 

@@ -1,4 +1,4 @@
-"""Memory of contact between steps, and its view of rods and obstacles in one iteration."""
+"""Memory of contact between steps, and its view of rods and obstacles in one pass."""
 
 from __future__ import annotations
 
@@ -11,35 +11,25 @@ from fastrod.contact.direct import BroadPhase
 from fastrod.contact.frames import back_by, between, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
-from fastrod.contact.trouble import sentence
-from fastrod.errors import Problem, ProblemSentence
-from fastrod.kernels.contact.iteration import NOTHING
-from fastrod.kernels.contact.problem import MOST_FOUND, contact_problem
+from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
-from fastrod.kernels.contact_batch import arrange, search_gaps, search_worlds
+from fastrod.kernels.contact_batch import search_gaps, search_worlds
 from fastrod.types import (
     CANDIDATE,
     CONTACT,
-    TROUBLE,
     Clearance,
     ContactMotion,
-    ContactProblem,
     ContactRods,
     ContactRows,
     ContactSet,
     Flags,
     Floats,
     Ints,
-    PointLoads,
-    Ports,
     RodShape,
-    SearchWork,
 )
 
 _FEW = 64  # robots below which starting threads costs more than it saves
-_MOST_WORKSPACES = 16  # sizes of contact problem whose room is kept
-_MOST_POINTS = 64  # contacts of a kept one: 1.2 MB a thread; of a larger one the solve takes far longer
 
 
 class ContactSnapshot(NamedTuple):
@@ -78,19 +68,11 @@ class Engine:
         self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
-        self.trouble = np.zeros(n, TROUBLE)
-        """Cause that kept each robot from rest in its last iteration."""
-        self.continued = np.zeros(n, bool)
-        """Robots that contact brought to the inputs of the last step."""
-        self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
-        """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
         self._broad: BroadPhase | None = None  # of scenes by FCL
-        self._workspace: dict[tuple[int, ...], tuple[ContactProblem, SearchWork]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what `pickle` and `copy` take: a workspace holds nothing between two iterations, and two
-        engines never share one."""
-        return {**self.__dict__, "_workspace": {}, "_broad": None}
+        """Return what `pickle` and `copy` take."""
+        return {**self.__dict__, "_broad": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take up what `pickle` or `copy` made: compiled shapes stand elsewhere in another process."""
@@ -115,6 +97,11 @@ class Engine:
                 np.broadcast_to(self.poses, shape),
                 np.broadcast_to(self.poses_before, shape),
             )
+
+    def begin_anew(self, cold: Flags) -> None:
+        """These robots have neither contacts nor a past."""
+        self.forget(cold)
+        self.place_at_once(cold)
 
     def forget(self, rows: Ints | Flags) -> None:
         """No contacts, no history."""
@@ -147,7 +134,7 @@ class Engine:
         """`rows` (n,) world by world."""
         ordered = rows[np.argsort(self.world[rows], kind="stable")]
         start = starts_of(self.world[ordered])
-        return ContactRows(start, ordered, np.zeros(0, np.int64), self.trouble[:0], np.zeros((0, 0)))
+        return ContactRows(start, ordered)
 
     @property
     def rods_meet(self) -> bool:
@@ -214,7 +201,7 @@ class Engine:
 
     def lower_gaps(self, rows: Ints, motion: ContactMotion) -> None:
         """Lower the gaps of these robots in `motion` to those between rods."""
-        search = RodSearch(motion, self.rods, self.contact_set, motion.frames.shape[1], 0.0)
+        search = RodSearch(motion, self.rods, self.contact_set, motion.frames.shape[1], 0.0, 0.0)
         search_worlds(self.in_worlds(rows), search, False)
 
     def accept(self, rows: Ints, shape: RodShape, between_steps: bool = False) -> None:
@@ -235,73 +222,12 @@ class Engine:
             self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
         )
 
-    def held(self, rows: Ints, ports: Ports, loads: PointLoads) -> Ports:
-        """The present contacts of these robots as loads of a pass, into `loads`, the last of which is a point
-        at the tip that carries none; the ports with nodes under them."""
-        ports = self.arranged(rows, ports, loads)
-        loads.node[:, -1], loads.force[:, -1], loads.arm[:, -1] = (
-            self.clearance.distance.shape[1] - 1,
-            0.0,
-            0.0,
-        )
-        return ports
-
-    def why(self, i: int, done: float) -> ProblemSentence:
-        """Return what stopped robot i, which came the fraction `done` of its step."""
-        gap = self.clearance.gap[i]
-        if self.trouble[i].cause == NOTHING:
-            if gap < 0.0:
-                deep = f"contact: the rod overlaps an obstacle by {-gap:.3g} m"
-                return ProblemSentence(f"{deep}, and no way out of it was found.", Problem.CONTACT_INSIDE)
-            unsolved = "contact: neither the rod's rest shape nor these inputs could be solved."
-            return ProblemSentence(unsolved, Problem.CONTACT_DIVERGED)
-        length = self.length[i if len(self.length) > 1 else 0]
-        return sentence(self.trouble[i], self.scene, self.rods.n_steps, length, done)
-
     def contacts(self, shape: RodShape, ok: Flags) -> Contacts:
         """The contacts of a state."""
         thinnest = np.maximum(self.rods.radius.min(1), 1e-6)
         return contacts_of(
             self.scene.names, self.contact_set, self.clearance, self.poses, shape, ok, thinnest
         )
-
-    def arranged(self, rows: Ints, ports: Ports, loads: PointLoads) -> Ports:
-        """The ports with a node under every contact; fills the point loads."""
-        n_robots, n_steps = len(self.tracked), self.rods.n_steps
-        n_segments = self.rods.radius.shape[1]
-        ends = np.cumsum(self.length + ports.extension, axis=1)
-        starts = np.concatenate([np.zeros((len(ends), 1)), ends], axis=1)
-        grid = np.empty((n_robots, n_segments, n_steps + 1))
-        m = self.given_arclength.shape[1]
-        node = np.zeros((n_robots, m), np.int64)
-        given = np.broadcast_to(self.given_arclength, (n_robots, m))
-        arrange(rows, self.contact_set, np.ascontiguousarray(given), starts, n_steps, grid, node, loads)
-        if not m:
-            return ports._replace(grid=grid)
-        node_force = np.zeros((n_robots, n_segments * n_steps + 1, 3))
-        force = np.broadcast_to(self.given_force, (n_robots, m, 3))
-        for q in range(m):
-            np.add.at(node_force, (rows, node[rows, q]), force[rows, q])
-        return ports._replace(grid=grid, node_force=node_force)
-
-    def workspace(
-        self, threads: int, n_rows: int, n_loads: int, n_x: int
-    ) -> tuple[ContactProblem, SearchWork]:
-        """Room, once for each thread, for worlds of at most `n_rows` rows with `n_loads` contacts and `n_x`
-        unknowns each, and for the search after them. Small ones are kept: to make one took 60 us of an
-        iteration's millisecond (16 robots on a bar)."""
-        size = (threads, n_rows, n_loads, n_x)
-        if (found := self._workspace.get(size)) is not None:
-            return found
-        made = (
-            contact_problem(*size, self.contact_set.contact.shape[1]),
-            search_work(threads, self.clearance.distance.shape[1]),
-        )
-        if n_rows * n_loads <= _MOST_POINTS:
-            if len(self._workspace) >= _MOST_WORKSPACES:
-                self._workspace.clear()
-            self._workspace[size] = made
-        return made
 
     def thread_count(self, n: int) -> int:
         """Threads for n robots, or worlds."""
@@ -351,18 +277,9 @@ def motion_of(
     tolerance: float,
     margin: float,
 ) -> ContactMotion:
-    """Put together what kernels read of one pass, without damping: `frames` now, before, and for slip."""
+    """Put together what kernels read of one pass: `frames` now, before, and for slip."""
     return ContactMotion(
-        *frames,
-        *(shape.position, shape.rotation, shape.curvature, shape.arclength, shape.residual),
-        *_curves(before),
-        *_curves(before),
-        *clearance,
-        tracked,
-        slides,
-        tolerance,
-        margin,
-        np.zeros(len(tracked)),
+        *frames, *_curves(shape), *_curves(before), *clearance, tracked, slides, tolerance, margin
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from fastrod.contact.engine import Engine, motion_of, unknown_clearance
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
-from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact_batch import cast_rays, search_gaps
 from fastrod.types import CANDIDATE, Flags, Floats, Ints, RodShape

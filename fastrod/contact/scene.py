@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from fastrod.contact.geometry import Obstacle
 from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked, shown
 from fastrod.model.robot import Robot
-from fastrod.types import ContactRods, Floats, Ints, Layout, Params
+from fastrod.types import ContactRods, Floats, Ints, Layout
 
 _BEYOND_TENDONS = 1.1  # a body radius of 0 stands for just beyond the outermost tendon (Segment.body_radius)
 
@@ -125,7 +125,7 @@ class ContactScene:
             )
         return np.asarray(np.unique(worlds, return_inverse=True)[1], dtype=np.int64)
 
-    def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> ContactRods:
+    def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout) -> ContactRods:
         """Return what contact needs to know of the robots of a simulator."""
         radius = np.array([self.radius_of(robot) for robot in robots])
         length = np.array([robot.length for robot in robots])
@@ -146,9 +146,6 @@ class ContactScene:
             each(first),
             each(spacing),
             each(length),
-            each(params.moment_scale),
-            each(params.tension_scale),
-            len(layout.free_tendon),
             layout.n_steps,
             float(self.rod_friction),
             1.0 / self.rod_stiffness,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from fastrod.types import Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
+from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Response, RodShape
 
 from .jit import LANES, OnThreads, call_at, entry, parallel_entry, take_next
 from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
@@ -32,11 +32,10 @@ def pass_some(
     memory: Memory,
     shape: RodShape,
     response: Response,
-    loads: PointLoads,
 ) -> None:
     """One forward pass of the robots of `run`, chunk by chunk, with the scratch of this task."""
     n = len(run.robots)
-    batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
+    batch, output = Batch(params, ports, layout, memory), Output(shape, response)
     mode = Mode(run.n_col, run.predict, run.propagate, run.update, run.process, run.noise)
     lanes = np.empty(LANES, np.int64)
     start = LANES * take_next(taken)
@@ -44,7 +43,7 @@ def pass_some(
         count = min(LANES, n - start)
         for w in range(LANES):
             lanes[w] = run.robots[start + min(w, count - 1)]
-        pass_chunk(Chunk(lanes, count, start), batch, output, run.scratch[task], mode)
+        pass_chunk(Chunk(lanes, count), batch, output, run.scratch[task], mode)
         start = LANES * take_next(taken)
 
 
@@ -60,10 +59,9 @@ def _pass_on_threads(
     memory: Memory,
     shape: RodShape,
     response: Response,
-    loads: PointLoads,
 ) -> None:
     for task in prange(n_tasks):
-        call_at(address, task, taken, run, params, ports, layout, memory, shape, response, loads)
+        call_at(address, task, taken, run, params, ports, layout, memory, shape, response)
 
 
 @entry

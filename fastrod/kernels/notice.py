@@ -15,7 +15,7 @@ _PLACE = "fastrod.kernels."
 SECONDS = {
     "pass_some": ("the rod", 40),
     "search_some": ("contact", 45),
-    "iterate_some": ("contact", 45),
+    "press_some": ("contact", 45),
     "pass_modes": ("modes", 50),
     "derive_modes": ("derivatives of modes", 15),
 }

@@ -18,8 +18,8 @@ from fastrod.types import (
 )
 
 from .contact.bvh import STACK
+from .contact.candidates import renew_contacts
 from .contact.contact_set import violation
-from .contact.iteration import renew_contacts
 from .contact.press import PressedWorld, Touching, end_contacts, gather_world, press
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
@@ -77,9 +77,11 @@ def press_some(
     hessian: Floats,
     gradient: Floats,
     change: Floats,
+    turn: Floats,
     first: int,
     yielding: float,
     renew: bool,
+    still: bool,
     step: Floats,
     changed: Flags,
 ) -> None:
@@ -99,15 +101,17 @@ def press_some(
         np.empty((m, 3)),
         np.empty((m, 5)),
         np.empty((m, 3, 3)),
+        np.empty((m, 2, n)),
+        np.empty((m, 3)),
         np.empty((n, n)),
         np.empty(n),
         np.empty((2, n)),
     )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
-    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, first, yielding)
+    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, turn, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        renewed = press(count, unknowns, contacts, pressing, renew)
+        renewed = press(count, unknowns, contacts, pressing, renew, still)
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
             changed[i] = renewed

@@ -14,7 +14,7 @@ from fastrod.kernels.batch import move_to_inputs, pass_robots
 from fastrod.kernels.jit import LANES
 from fastrod.kernels.rod.workspace import Mode, Run, scratch_size
 from fastrod.solver.gpu.device import Device
-from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
+from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, Response, RodShape
 
 if TYPE_CHECKING:
     from fastrod.solver.gpu.resident import Resident
@@ -22,13 +22,6 @@ if TYPE_CHECKING:
 
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
-NO_LOADS = PointLoads(
-    np.empty((0, 0), np.int64),
-    np.empty((0, 0, 3)),
-    np.empty((0, 0, 3)),
-    np.empty((0, 0, 0)),
-    np.empty((0, 0, 0)),
-)
 
 
 def check_size(layout: Layout, n_robots: int, outputs: Literal["full", "tip"]) -> None:
@@ -180,7 +173,7 @@ class BoundarySolver:
         )
 
     def n_columns(self, ports: Ports) -> int:
-        """Columns of sensitivities that a pass carries without contact."""
+        """Columns of sensitivities that a pass carries."""
         return self.n_x + (3 if self.tracks_force and not len(ports.follower_force) else 0)
 
     def _fields(self, follower: bool, track_force: bool) -> list[tuple[int, ...]]:
@@ -263,13 +256,11 @@ class BoundarySolver:
         process: float = 1.0,
         noise: float = 1.0,
         n_col: int | None = None,
-        loads: PointLoads = NO_LOADS,
     ) -> None:
         """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after
         `collect`."""
-        n_loads = loads.node.shape[1]
         if n_col is None:
-            n_col = self.n_x + 3 * n_loads if n_loads else self.n_columns(ports)
+            n_col = self.n_columns(ports)
         if response is None:
             response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
         mode = Mode(n_col, predict, propagate, update, float(process), float(noise))
@@ -278,9 +269,9 @@ class BoundarySolver:
             return
         tasks = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
         n_tendons, n_e = len(self.layout.tendon_segment), self.n_residuals(ports)
-        scratch = np.empty((tasks, scratch_size(n_tendons, self.n_x, n_col, n_e, n_loads)))
+        scratch = np.empty((tasks, scratch_size(n_tendons, self.n_x, n_col, n_e)))
         run = Run(rows, scratch, *mode)
-        pass_robots(tasks, run, self.params, ports, self.layout, self._memory, shape, response, loads)
+        pass_robots(tasks, run, self.params, ports, self.layout, self._memory, shape, response)
 
     def collect(self, shape: RodShape, only: str | None = None) -> RodShape:
         """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""

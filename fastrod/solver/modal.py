@@ -165,8 +165,8 @@ def _inertia(density: float, radius: float) -> tuple[float, float, float]:
 def no_points(n_robots: int) -> ModalPoints:
     """No point force."""
     n_nodes = N_INTERVALS + 1
-    zeros = np.zeros((n_robots, 0), np.int64), np.zeros((n_robots, 0, n_nodes)), np.zeros((n_robots, 0, 3))
-    return ModalPoints(*zeros)
+    row = np.zeros((n_robots, 0, n_nodes))
+    return ModalPoints(np.zeros((n_robots, 0), np.int64), row, row.copy(), np.zeros((n_robots, 0, 3)))
 
 
 _LEAK = 1e-9
@@ -241,6 +241,23 @@ class ModalSolver:
         gravity = self.gravity if acting.gravity is None else acting.gravity
         self.pieces = self.pieces._replace(gravity=gravity)
         self.place_points(*acting.points, acting.ports.extension)
+
+    def bend_as(self, rows: Ints, shape: RodShape, ports: Ports) -> None:
+        """Let the curvature of these robots be nearest to that of a shape, by least squares."""
+        samples, basis, q = self.samples, self.basis, self.motion.q
+        table, n_modes = ports.precurvature, len(basis.component)
+        table = table[rows] if len(table) > 1 else np.broadcast_to(table, (len(rows), *table.shape[1:]))
+        for p, segment in enumerate(self.pieces.segment):
+            here = np.flatnonzero(samples.piece == p)
+            place = samples.place[here, -1] * (table.shape[2] - 1)
+            first = np.minimum(place.astype(np.int64), max(table.shape[2] - 2, 0))
+            last, x = np.minimum(first + 1, table.shape[2] - 1), (place - first)[:, None]
+            rest = (1.0 - x) * table[:, segment, first] + x * table[:, segment, last]
+            bent = shape.curvature[rows[:, None], here] - rest
+            for c in range(3):
+                some = np.flatnonzero(basis.component == c)
+                modes = samples.here[here][:, basis.degree[some]]
+                q[rows[:, None], p * n_modes + some] = bent[:, :, c] @ np.linalg.pinv(modes).T
 
     def start_straight(self, rows: Ints) -> None:
         """Let these robots begin from their shape without loads."""
@@ -395,13 +412,14 @@ class ModalSolver:
             "inertia": (m,),
             "point": (n_points, 3),
             "point_change": (n_points, 3, n_q),
+            "tangent_change": (n_points, 3, n_q),
         }
         left_out = {"hessian", "mass", "damping", "number", "point"} - set(wanted)
         left_out -= {"number"} if followed else set()
         if "number" in left_out:
             left_out |= {"number_change", "inertia"}
         if "point" in left_out:
-            left_out |= {"point_change"}
+            left_out |= {"point_change", "tangent_change"}
         found = ModalDerivatives(
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )
@@ -449,6 +467,7 @@ class ModalSolver:
         self.points = ModalPoints(
             np.ascontiguousarray(segment * per + inside),
             integral_row(x - inside),
+            lagrange_row(x - inside),
             np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
         )
 

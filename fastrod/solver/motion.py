@@ -223,7 +223,9 @@ class ModalRods:
     def check(self, kept: object) -> None:
         """Raise `InputError` where this is the memory of other rods."""
         if not isinstance(kept, ModalMemory):
-            raise InputError("the snapshot is of another simulator; its solver differs.")
+            raise InputError(
+                "the snapshot is of another simulator; its solver differs, or its contact scene."
+            )
         if [a.shape for a in kept.motion] != [a.shape for a in self.modal.motion]:
             raise InputError("the snapshot is of another simulator; its modes or robots differ.")
         if kept.scheme != self._remembered_for:

@@ -85,7 +85,7 @@ class ObserverSolver:
         boundary = Boundary(passes) if self.recover else None
         if before is not None:
             if self._learns and _alike(before, ports):
-                self._learn_force(rows[last.warm[rows]], before)
+                self.learn(rows[last.warm[rows]], before)
             stretch(passes, rows, ports.extension - before.extension)
         if len(cold := rows[~last.warm[rows]]):
             cold_start(cold, passes.layout, passes.params, ports, passes.memory)
@@ -143,8 +143,8 @@ class ObserverSolver:
             rows, ports, shape, predict=predict, propagate=propagate, process=process, noise=noise
         )
 
-    def _learn_force(self, rows: Ints, ports: Ports) -> None:
-        """A pass that changes nothing but the gain, which now knows a tip force."""
+    def learn(self, rows: Ints, ports: Ports) -> None:
+        """A pass on the inputs at which these robots are: it changes little but the gain."""
         self._observe(rows, ports, self.new_shape("tip", True), predict=False)
 
     def _keeps_jacobian(self, last: Last) -> Flags:
@@ -181,7 +181,9 @@ class ObserverSolver:
     def check(self, kept: object) -> None:
         """Raise `InputError` where this is the memory of other rods."""
         if not isinstance(kept, Memory):
-            raise InputError("the snapshot is of another simulator; its solver differs.")
+            raise InputError(
+                "the snapshot is of another simulator; its solver differs, or its contact scene."
+            )
         n_rows = len(self.passes.layout.row_tendon)
         if (len(kept.x), kept.length_before.shape[1]) != (len(self._all), n_rows):
             raise InputError(
@@ -201,7 +203,7 @@ class ObserverSolver:
         )
         if passes.tracks_force and not len(kept.force_before) and _alike(acting.ports, then.ports):
             # their gain knows no tip force yet, which moves by now: learned as `step` does
-            self._learn_force(np.flatnonzero(rows & then.warm), acting.ports)
+            self.learn(np.flatnonzero(rows & then.warm), acting.ports)
 
 
 def _moves(before: Floats | None, force: Floats, warm: Flags) -> bool:

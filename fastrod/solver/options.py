@@ -173,11 +173,6 @@ def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool,
             raise InputError(
                 f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
             )
-        if isinstance(solver, Modal) and contact.self_contact and feel_contact:
-            raise InputError(
-                "contact was given with self_contact and rods of modes, which do not feel themselves; take "
-                "solver='observer', at rest, or self_contact=False."
-            )
     if isinstance(solver, Modal) and device == "cuda":
         raise InputError("device was given with rods of modes, which do not take it; leave it out.")
     if device == "cuda" and contact is not None and feel_contact:

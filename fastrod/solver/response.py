@@ -1,4 +1,4 @@
-"""Linear response of robots at rest: how the tip answers inputs and forces, contact forces held."""
+"""Linear response of the observer's robots: how the tip answers inputs and forces."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from fastrod.kernels.jit import LANES
-from fastrod.solver.boundary import NO_LOADS, BoundarySolver, new_shape
-from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Response, RodShape
+from fastrod.solver.boundary import BoundarySolver, new_shape
+from fastrod.types import Floats, Ints, Memory, Params, Ports, Response, RodShape
 
 _ROWS = 1024  # of one pass: robots times copies of them
 _HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
@@ -23,40 +23,24 @@ Relocate = Callable[[Floats], Mapping[str, Floats]]
 
 
 class Linear:
-    """Passes that change nothing, at the present boundary of `rows`, with their linear response.
+    """Passes that change nothing, at the present boundary of `rows`, with their linear response."""
 
-    `loads` are the contact forces that act on each row of `rows`. The last one is at the tip and carries
-    none: its columns are those of a tip force.
-    """
-
-    def __init__(
-        self, passes: BoundarySolver, rows: Ints, ports: Ports, loads: PointLoads = NO_LOADS
-    ) -> None:
-        self.passes, self.rows, self.ports, self.loads = passes, rows, ports, loads
+    def __init__(self, passes: BoundarySolver, rows: Ints, ports: Ports) -> None:
+        self.passes, self.rows, self.ports = passes, rows, ports
 
     def respond(self, columns: bool = True) -> tuple[Response, RodShape]:
         """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; other rows
         are nan."""
         passes, ports = self.passes, self.ports
-        n, n_e, n_loads = passes.n_robots, passes.n_residuals(ports), self.loads.node.shape[1]
-        extra = 3 * n_loads if n_loads else 0 if len(ports.follower_force) else 3
-        n_col = passes.n_x + extra if columns or n_loads else 0
+        n, n_e = passes.n_robots, passes.n_residuals(ports)
+        n_col = passes.n_x + (0 if len(ports.follower_force) else 3) if columns else 0
         holes = len(self.rows) < n
         response = Response(np.empty((n, n_e, n_col)), np.empty((n, 6, n_col)), np.empty((n, n_e)))
         if holes:
             for a in response:
                 a.fill(np.nan)
         shape = new_shape(passes.layout, passes.n_robots, "tip", holes)
-        passes.run(
-            self.rows,
-            ports,
-            shape,
-            response=response,
-            update=False,
-            noise=1e-20,
-            n_col=n_col,
-            loads=self.loads,
-        )
+        passes.run(self.rows, ports, shape, response=response, update=False, noise=1e-20, n_col=n_col)
         return response, passes.collect(shape)
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
@@ -222,16 +206,15 @@ class Linear:
             Params(*(a if len(a) == 1 else copied(a) for a in params)),
             Memory(*map(copied, passes.peek())),
         )
-        loads = PointLoads(*map(copied, self.loads)) if self.loads.node.shape[1] else self.loads
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
-        return Linear(twin, rows, ports, loads)
+        return Linear(twin, rows, ports)
 
     def by_force(self) -> Floats:
         """(n, 6, 3) change of the tip per tip force."""
         response, _ = self.respond()
         n_x, params = self.passes.n_x, self.passes.params
         free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
-        if len(self.ports.follower_force) and not self.loads.node.shape[1]:
+        if len(self.ports.follower_force):
             # the follower force is an unknown; a dead force enters as its column, but not its own row
             load = load.copy()
             load[:, -3:] -= (params.rod_length**2 / params.moment_scale)[:, None, None] * np.eye(3)

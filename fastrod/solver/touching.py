@@ -8,6 +8,7 @@ that are held up after each; rods that never move have a mass for them that is n
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem, ProblemSentence
-from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
@@ -25,6 +26,7 @@ from fastrod.kernels.press_batch import end_some, press_some, renew_some, violat
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
+from fastrod.solver.merge import merge_arrays
 from fastrod.solver.modal import Step, in_threads
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
@@ -32,19 +34,21 @@ from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
-from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports
+from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
-_PASSES = 8
+_PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
+_FOLLOWING = 4  # first steps to a rest, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step uses are updated
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
+_SAME_GAP = 1e-10  # m
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
-_AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
-_MOST_STEPS, _GROWS = 100, 4.0  # to a rest, and by how much they grow
-_FIRST, _LONGEST, _GIVEN_UP = 1e-3, 1.0, 1e-9  # s: their lengths
+AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
+_MOST_STEPS, _GROWS, _FALLS = 100, 16.0, 1.0 / 16.0  # to a rest, and by how much they grow, or fall
+_FIRST, _RESTS, _LONGEST, _GIVEN_UP = 1e-3, 1.0, 1e4, 1e-9  # s: their lengths
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
@@ -56,8 +60,9 @@ class TouchingRods(ModalRods):
         self, engine: Engine, options: Modal, robots: tuple[Robot, ...], *given: Any, **named: Any
     ) -> None:
         # a force between its ends makes a kink in the curvature of a segment
-        pieces = 2 if robots[0].n_segments == 1 else 1
-        usual = Modes(4, 2, pieces=pieces) if options.dynamics else Modes(6, 4, pieces=pieces)
+        usual = Modes(4, 2)
+        if robots[0].n_segments == 1:
+            usual = Modes(4, 2, pieces=2) if options.dynamics else Modes(6, 4, pieces=2)
         options = replace(options, modes=options.modes or usual)
         super().__init__(options, robots, *given, **{**named, "outputs": "full"})
         self.engine = engine
@@ -98,8 +103,8 @@ class TouchingRods(ModalRods):
     def step(self, rows: Ints, acting: Acting, last: Last, how: How) -> Solved:
         """Move these robots on by dt, or bring them to rest."""
         engine, stepper, before = self.engine, self.stepper, last.ports
-        found, cold = self._begin(acting), engine.whole_worlds(self._mask(rows) & ~last.warm)
-        ok = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, found, _AT_REST)
+        found, cold = self.begin(acting), engine.whole_worlds(self._mask(rows) & ~last.warm)
+        ok = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, last, found, AT_REST)
         warm = rows[~cold[rows]] if self.dynamics and before is not None else rows[:0]
         if len(warm) and before is not None:
             start, inputs = copied(self.modal.motion), (before, acting.ports)
@@ -111,21 +116,24 @@ class TouchingRods(ModalRods):
             some = warm[meets[warm]]
             _put(self.modal.motion, start, some)
             ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
-        return self._end(rows, ok, found, acting, last)
+        engine.accept(rows[ok[rows]], found.shape)
+        return self.end(rows, ok, found, acting, last)
 
     def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
         """Bring these robots to rest, to `tolerance` [m] in a step of a second."""
-        found, cold = self._begin(acting), self.engine.whole_worlds(self._mask(rows) & ~last.warm)
-        return self._end(rows, self._rest(rows, cold, acting, found, tolerance), found, acting, last)
+        found, cold = self.begin(acting), self.engine.whole_worlds(self._mask(rows) & ~last.warm)
+        ok = self._rest(rows, cold, acting, last, found, tolerance)
+        self.engine.accept(rows[ok[rows]], found.shape)
+        return self.end(rows, ok, found, acting, last)
 
-    def _begin(self, acting: Acting) -> PassShapes:
+    def begin(self, acting: Acting) -> PassShapes:
+        """Let all this act on the robots; room for their shapes."""
         self._take(acting)
         self._passes[:], self._blocked[:], self._nearest = 0, False, {}
         return self._room(True)
 
-    def _end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
+    def end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
         """The state, with what has stopped those that are not ok; they go on from where they were."""
-        self.engine.accept(rows[ok[rows]], found.shape)
         self.engine.end_step(ok.astype(float))
         solved = self._solved(found, ok, acting.ports)
         passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
@@ -136,7 +144,7 @@ class TouchingRods(ModalRods):
             inside = f"would be {self._deep[i]:.2g} m inside"
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
-            said, kind = f"{said}; come there in smaller changes.", Problem.CONTACT_STUCK
+            said, kind = f"{said}; come there in smaller steps.", Problem.CONTACT_STUCK
             if self._blocked[i]:
                 said = "contact: neither the rod's rest nor its straight shape is clear; begin where it is."
                 kind = Problem.CONTACT_INSIDE
@@ -147,43 +155,72 @@ class TouchingRods(ModalRods):
     def _mask(self, rows: Ints) -> Flags:
         return np.isin(np.arange(self.n_robots), rows)
 
-    def _rest(self, rows: Ints, cold: Flags, acting: Acting, found: PassShapes, tolerance: float) -> Flags:
-        """(n_robots,) who came to rest: freely, or else in steps of BDF1 that are held up after each, from
-        where they are; `cold` ones from straight."""
-        engine, modal, ports, ok = self.engine, self.modal, acting.ports, np.zeros(self.n_robots, bool)
-        engine.forget(cold)
-        engine.place_at_once(cold)
-        start, pressed, fresh = copied(modal.motion), engine.pressed(), rows[cold[rows]]
+    def _rest(
+        self, rows: Ints, cold: Flags, acting: Acting, last: Last, found: PassShapes, tolerance: float
+    ) -> Flags:
+        """(n_robots,) who came to rest: freely, or else as `rest_pressed`."""
+        engine, motion, ok = self.engine, self.modal.motion, np.zeros(self.n_robots, bool)
+        engine.begin_anew(cold)
+        start, pressed = copied(motion), engine.pressed()
         free = rows[~pressed[rows]]
-        ok[free] = self.stepper.rest(free, fresh, ports, found, min(tolerance, _AT_REST))
+        ok[free] = self.stepper.rest(free, rows[cold[rows]], acting.ports, found, min(tolerance, AT_REST))
         meets = engine.whole_worlds(pressed | (self._mask(free) & ~ok))
         meets |= engine.overlap(free[~meets[free]], found.shape)
-        _put(modal.motion, start, still := rows[meets[rows]])
-        ok[still] = False
-        if len(fresh := fresh[meets[fresh]]):  # from straight, where that is clear
-            straight = unloaded(ports, modal.layout, modal.params)
-            clear = self._mask(fresh[self.stepper.rest(fresh, fresh, straight, found, _AT_REST)])
+        _put(motion, start, some := rows[meets[rows]])
+        ok[some] = self.rest_pressed(some, cold, acting, last, found, tolerance)[some]
+        return ok
+
+    def rest_pressed(
+        self, rows: Ints, cold: Flags, acting: Acting, last: Last, found: PassShapes, tolerance: float
+    ) -> Flags:
+        """(n_robots,) who came to rest in steps of BDF1 that are held up after each: from where they are,
+        `cold` ones from straight. Where one does not end, the next is shorter, and leads less far to the
+        inputs."""
+        engine, modal, n, ports = self.engine, self.modal, self.n_robots, acting.ports
+        start, straight = last.ports or ports, unloaded(ports, modal.layout, modal.params)
+        if len(fresh := rows[cold[rows]]):
+            start = merge_arrays(start, straight, self._mask(fresh))
+            clear = self._mask(fresh[self.stepper.rest(fresh, fresh, straight, found, AT_REST)])
             clear &= ~engine.whole_worlds(engine.overlap(np.flatnonzero(clear), found.shape))
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
             self._blocked[fresh[~clear[fresh]]] = True
-            still = still[clear[still] | ~cold[still]]
-        size, tried = np.full(self.n_robots, _FIRST), still
-        for _ in range(_MOST_STEPS if len(still) else 0):
-            for each in np.unique(size[still]):
-                some = still[size[still] == each]
+        engine.slides[rows] = ~cold[rows]  # who comes from nowhere has not slipped
+        ok, done, part, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
+        size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
+        for _ in range(_MOST_STEPS if len(left) else 0):
+            aim = np.minimum(done + part, 1.0)
+            follow = there < _FOLLOWING
+            for each, follows in itertools.product(np.unique(size[left]), (False, True)):
+                some = left[(size[left] == each) & (follow[left] == follows)]
+                if not len(some):
+                    continue
+                inputs = ports if (aim[some] >= 1.0).all() else blended(start, ports, aim)
                 self._hold_up(some)
-                was = modal.motion.place.copy()
-                well = self._advance_pressed(some, acting, (ports, ports), (0.0, 1.0), found, float(each))
+                was, how = modal.motion.place.copy(), Step(BDF1, float(each))
+                well = self._one(some, acting, inputs, how, (done.copy(), aim), found, follows)
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
-                engine.place_at_once(well)
+                done[well] = aim[well]
+                arrived = well & (done >= 1.0)
+                there += arrived
+                engine.place_at_once(arrived)
+                self._measure_anew(np.flatnonzero(well & ~arrived))
                 moved = np.abs(modal.motion.place - was).max(1) >= max(tolerance, _CREEPS)
-                ok[some] = (well & ~engine.whole_worlds(moved))[some] & (each >= _LONGEST)
-                size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), 0.25 * each)
-            still = still[~ok[still] & (size[still] > _GIVEN_UP)]
-            if not len(still):
+                ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
+                size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), _FALLS * each)
+                part[some] *= np.where(well[some], 4.0, 0.25)
+            left = left[~ok[left] & (size[left] > _GIVEN_UP)]
+            left = left[self._passes[left] < engine.scene.max_iterations]
+            if not len(left):
                 break
-        self._hold_up(tried)
+        engine.slides[rows] = True
+        self._hold_up(rows)
         return ok
+
+    def take_over(self, rows: Ints, shape: RodShape, ports: Ports, found: PassShapes) -> None:
+        """Let these robots begin from a shape that other means have found on these inputs."""
+        modal = self.modal
+        modal.bend_as(rows, shape, ports)
+        modal.settle(rows, ports, *found, np.inf, self.stepper.time.scheme)
 
     @property
     def _is_rigid(self) -> bool:
@@ -207,27 +244,24 @@ class TouchingRods(ModalRods):
         inputs: tuple[Ports, Ports],
         span: tuple[float, float],
         found: PassShapes,
-        length: float | None = None,
     ) -> Flags:
-        """(n_robots,) who of these, in whole worlds, moved on over this fraction `span` of a step of `length`
-        [s] (dt), along which the inputs change evenly; the others are as they were."""
+        """(n_robots,) who of these, in whole worlds, moved on over this fraction `span` of a step, along
+        which the inputs change evenly; the others are as they were."""
         engine, motion, n = self.engine, self.modal.motion, self.n_robots
-        (first, last), ok = span, np.zeros(n, bool)
+        (first, last), ok, one = span, np.zeros(n, bool), np.ones(n)
         if not len(rows):
             return ok
-        whole = self.stepper.time.dt if length is None else length
         ports = inputs[1] if last >= 1.0 else blended(*inputs, np.full(n, last))
         start, contacts = copied(motion), ContactSet(*(a.copy() for a in engine.contact_set))
-        ok = self._one(rows, acting, ports, Step(BDF1, (last - first) * whole), span, found)
+        how = Step(BDF1, (last - first) * self.stepper.time.dt)
+        ok = self._one(rows, acting, ports, how, (first * one, last * one), found, True)
         left = lost = rows[~ok[rows]]
-        self._go_back(lost, contacts)
-        # a step to a rest is taken again by who asks for it, shorter
-        if not len(lost) or length is not None or last - first < 1.5 * 4.0**-_DIVISIONS:
+        if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
         before = engine.before
         for k in range(4):
             fraction = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
-            left = left[self._advance_pressed(left, acting, inputs, fraction, found, length)[left]]
+            left = left[self._advance_pressed(left, acting, inputs, fraction, found)[left]]
             self._measure_anew(left)
             if k < 3:
                 engine.accept(left, found.shape, between_steps=True)
@@ -260,16 +294,20 @@ class TouchingRods(ModalRods):
         acting: Acting,
         ports: Ports,
         how: Step,
-        span: tuple[float, float],
+        span: tuple[Floats, Floats],
         found: PassShapes,
+        follow: bool,
     ) -> Flags:
-        """(n_robots,) who moved on in one step: those in whose world Newton's method has ended."""
+        """(n_robots,) who moved on in one step: those in whose world Newton's method has ended. With `follow`
+        contacts go first where the gap is least."""
         engine, modal, n, motion = self.engine, self.modal, self.n_robots, self.modal.motion
         contacts, q, left = engine.contact_set, motion.q + how.dt * motion.rate, rows
+        then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
+        most = _PASSES if self.dynamics else _TO_REST
         size, deep, ok = np.full(n, np.inf), self._deep, np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
-        for count in range(_PASSES + 1):
+        for count in range(most + 1):
             worlds = engine.in_worlds(left)
             left = worlds.robot
             world, near, n_found = self._seen(left, ports, how, q, found, span)
@@ -278,26 +316,37 @@ class TouchingRods(ModalRods):
                 q[through] = motion.q[through]
                 world, near, n_found = self._seen(left, ports, how, q, found, span)
                 through = self._mask(left[n_found < 0])
-            search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin)
+            search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin, _SAME_GAP)
             violations(worlds, search, engine.surfaces, near, n_found, deep)
             if self._is_rigid:  # the whole rod, and not what its candidates show
                 np.maximum(deep, -engine.clearance.gap, out=deep)
+            if count and not self.dynamics:  # it is led there by a shorter way
+                gone = engine.whole_worlds(through)
+                left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]
             busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
             ok |= self._mask(left) & ~engine.whole_worlds(busy & self._mask(left))
             keep = ~ok[left]
             left, near, n_found = left[keep], near[keep], np.maximum(n_found[keep], 0)
-            if not len(left) or count == _PASSES:
+            if not len(left) or count == most:
                 self._note_nearest(left, near, n_found)
                 break
-            still, seen = count >= _MOVING, (engine.rods, engine.surfaces, world, contacts)
+            still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
             renew_some(left, *seen, near, n_found, still)
-            if engine.rods_meet and not still:
-                search_worlds(engine.in_worlds(left), search, True)
+            if engine.rods_meet:
+                closer = 0.1 * _INSIDE if still else _SAME_GAP
+                search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
             modal.place_points(*self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
-            yielding = (span[1] - span[0]) ** 2
-            model = d.hessian, d.gradient, d.point_change, acting.points[0].shape[1], yielding
-            self._press(left, (*seen, *model, count < _RENEWING, step, changed))
+            yielding = (how.dt / self.stepper.time.dt) ** 2 if self.dynamics else 1.0
+            model = (
+                d.hessian,
+                d.gradient,
+                d.point_change,
+                d.tangent_change,
+                acting.points[0].shape[1],
+                yielding,
+            )
+            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
             q[left] += step[left]
             size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
             self._passes[left] += 1
@@ -308,6 +357,7 @@ class TouchingRods(ModalRods):
             modal.place_points(*self._points(arrived, acting), ports.extension)
             modal.hold(arrived, ports, *found, how, q, True)
             end_some(arrived, contacts)
+        self._go_back(rows[~ok[rows]], then)
         modal.place_points(*acting.points, ports.extension)
         return ok
 
@@ -330,13 +380,13 @@ class TouchingRods(ModalRods):
         in_threads(len(batches), press)
 
     def _seen(
-        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[float, float]
+        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[Floats, Floats]
     ) -> tuple[ContactMotion, Any, Ints]:
         """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
         through."""
-        engine, n = self.engine, self.n_robots
+        engine = self.engine
         self.modal.hold(rows, ports, *found, how, q, False)
-        world = engine.motion(found.shape, _INSIDE, np.full(n, span[0]), np.full(n, span[1]))
+        world = engine.motion(found.shape, _INSIDE, *span)
         near, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         threads = engine.thread_count(len(rows))
         work = search_work(threads, found.shape.arclength.shape[1])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fastrod.contact import ContactScene, box, plane
-from fastrod.kernels.contact.mobility import add_mobility
 from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
 
@@ -59,38 +58,6 @@ def test_body_that_is_hit_off_its_middle_gives_way_by_turning():
         depth[turn] = -contacts.gap[0, 0]
         assert depth[turn] == pytest.approx(expected, rel=1e-2, abs=2e-6)
     assert depth[2.0] > 10.0 * depth[0.0]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_mobility_is_that_of_a_rigid_body(seed):
-    # W_ce = A_c (1/m + [r_c]^T I^-1 [r_e]) A_e^T for contacts on one body, nothing between two bodies or with
-    # a rod
-    rng = np.random.default_rng(seed)
-    m = 5
-    touched = np.array([0, 1, 2, 0, -1])
-    body = np.array([7, 7, 8])
-    place = rng.normal(size=(m, 3))
-    axes = np.array([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(m)])
-    give = np.zeros((3, 13))
-    for number in (7, 8):
-        root = rng.normal(size=(3, 3))
-        give[body == number] = [rng.uniform(0.1, 1.0), *(root @ root.T).ravel(), *rng.normal(size=3)]
-    W = rng.normal(size=(3 * m, 3 * m))
-    expected = W.copy()
-
-    def hat(v):
-        return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-
-    for c in range(m):
-        for e in range(m):
-            if touched[c] >= 0 and touched[e] >= 0 and body[int(touched[c])] == body[int(touched[e])]:
-                g = give[int(touched[c])]
-                block = g[0] * np.eye(3) + hat(place[c] - g[10:]).T @ g[1:10].reshape(3, 3) @ hat(
-                    place[e] - g[10:]
-                )
-                expected[3 * c : 3 * c + 3, 3 * e : 3 * e + 3] += axes[c] @ block @ axes[e].T
-    add_mobility(m, touched, place, axes, body, give, W)
-    np.testing.assert_allclose(W, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("stiffness", [10.0, 1e3, 1e5])

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numba
 import numpy as np
 import pytest
-
-from fastrod.kernels.contact_batch import iterate_some
 
 
 @pytest.mark.study
@@ -72,20 +67,3 @@ def test_a_rod_that_slides_off_comes_to_rest(scenes, index, row):
     assert played.ok.all(), played.sentences
     assert np.nanmax(played.depth) < 3e-5
     assert played.passes.max() < 600
-
-
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
-def test_several_robots_beside_an_obstacle_at_rest_slide_off_by_the_same_kernels(scenes):
-    """A copy of a broadcast array has another layout, and contact would be compiled once more: two minutes in
-    the middle of a step."""
-    batch = scenes.make_batch(1, 116)
-    pose = batch.pose[0, 1]
-    still = replace(
-        batch.obstacle, position=tuple(pose[:3]), quaternion=tuple(pose[3:] / np.linalg.norm(pose[3:]))
-    )
-    scene = scenes.ContactScene(obstacles=[still], rod_radius=batch.rod_radius)
-    sim = scenes.Simulator(batch.robot, 3, points_per_segment=batch.points, threads=1, contact=scene)
-    for lengths in batch.tendon_length[:, [1, 1, 1]]:
-        state = sim.step(lengths)
-        assert np.array_equal(state.ok, [state.ok[0]] * 3)
-    assert len(iterate_some.signatures) == 1

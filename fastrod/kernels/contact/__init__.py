@@ -1,1 +1,1 @@
-"""Proximity, contact set, contact law, and one contact iteration."""
+"""Proximity, contacts of a rod, and their forces."""

@@ -42,14 +42,6 @@ def curve_before(motion: ContactMotion, i: int) -> Curve:
 
 
 @inline
-def curve_slip(motion: ContactMotion, i: int) -> Curve:
-    """Robot i at the last step."""
-    return Curve(
-        motion.position_slip[i], motion.rotation_slip[i], motion.curvature_slip[i], motion.arclength_slip[i]
-    )
-
-
-@inline
 def _weights(fraction: float, h: float) -> tuple[float, float, float, float]:
     """Return the weights of the value at the start, the slope there, the value at the end and the slope
     there."""
@@ -79,6 +71,19 @@ def tangent_at(curve: Curve, j: int, fraction: float) -> Vec:
     t, h = fraction, curve.arclength[j + 1] - curve.arclength[j]
     a = 6.0 * t * (t - 1.0) / h
     b, d = (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
+    p, q, r, s = curve.position[j], curve.rotation[j], curve.position[j + 1], curve.rotation[j + 1]
+    return (
+        a * (p[0] - r[0]) + b * q[0, 2] + d * s[0, 2],
+        a * (p[1] - r[1]) + b * q[1, 2] + d * s[1, 2],
+        a * (p[2] - r[2]) + b * q[2, 2] + d * s[2, 2],
+    )
+
+
+@inline
+def bend_at(curve: Curve, j: int, fraction: float) -> Vec:
+    """Second derivative of that curve."""
+    t, h = fraction, curve.arclength[j + 1] - curve.arclength[j]
+    a, b, d = (12.0 * t - 6.0) / (h * h), (6.0 * t - 4.0) / h, (6.0 * t - 2.0) / h
     p, q, r, s = curve.position[j], curve.rotation[j], curve.position[j + 1], curve.rotation[j + 1]
     return (
         a * (p[0] - r[0]) + b * q[0, 2] + d * s[0, 2],

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from fastrod.types import Floats, Records, Surfaces
 
 from ..jit import inline, kernel
-from ..vec import Vec, dot, scale
+from ..vec import Vec, dot
 from .bvh import FAR, Numbers, Record, normal_of
 from .surface import ray_hit, signed_distance, walls
 
@@ -57,27 +57,18 @@ def carries(contact: Record) -> bool:
 
 
 @inline
-def arm_of(contact: Record) -> Vec:
-    """Return the arm from the centreline to where the force acts."""
-    return scale(-contact.arm, normal_of(contact))
-
-
-@inline
 def set_normal(contact: Record, n: Vec) -> None:
     """Unit vector toward the rod, world."""
     contact.normal[0], contact.normal[1], contact.normal[2] = n
 
 
 @inline
-def open_contact(
-    contact: Record, obstacle: int, s: float, n: Vec, gap: float, radius: float, friction: float
-) -> None:
-    """Write a contact that carries nothing yet: normal n, world, `gap` and `radius` [m]. Only friction gives
-    its force an arm."""
+def open_contact(contact: Record, obstacle: int, s: float, n: Vec, gap: float, radius: float) -> None:
+    """Write a contact that carries nothing yet: normal n, world, `gap` and `radius` [m]."""
     contact.obstacle, contact.partner = obstacle, -1
     contact.arclength, contact.gap, contact.radius = s, gap, radius
     set_normal(contact, n)
-    contact.arm, contact.shift, contact.damped_stiffness = radius if friction > 0.0 else 0.0, FAR, 0.0
+    contact.shift = FAR
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
     contact.held[0], contact.held[1], contact.held[2], contact.slid = 0.0, 0.0, 0.0, 0.0
     contact.place[0], contact.place[1], contact.place[2] = FAR, FAR, FAR
@@ -243,14 +234,15 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
 def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
-    near = rules.tolerance if rules.still else _SAME_GAP if contact.arm > 0.0 else 0.0
+    rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
+    near = rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
     if candidate.gap >= contact.gap - near:
         return True
     if rules.still:
         return False
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
-    if settles or not carries(contact) or contact.arm > 0.0:
+    if settles or not carries(contact) or rubs:
         contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
         return True
     return False
@@ -276,8 +268,7 @@ def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: Cont
     if not 0 <= at < len(contacts):
         return n
     radius = rules.radius[segment_at(rules.arclength, rules.n_steps, s)]
-    friction = rules.surfaces.friction[candidate.obstacle]
-    open_contact(contacts[at], candidate.obstacle, s, normal, gap, radius, friction)
+    open_contact(contacts[at], candidate.obstacle, s, normal, gap, radius)
     contacts[at].matched = True
     return max(n, at + 1)
 
@@ -304,35 +295,6 @@ def choose(n_found: int, found: Records, count: int, contacts: Records, rules: C
             if candidate.gap >= held - rules.tolerance:
                 continue  # a contact more would only stiffen the obstacle
         n = _add(candidate, n, contacts, apart, rules)
-    return n
-
-
-@kernel
-def stands(count: int, contacts: Records, tolerance: float) -> bool:
-    """Contacts without friction that need no law: none is deeper than `tolerance`, none presses that is open
-    by more, none pulls."""
-    for c in range(count):
-        contact = contacts[c]
-        press = dot(force_of(contact), normal_of(contact))
-        if (
-            contact.arm > 0.0
-            or contact.gap < -tolerance
-            or press < 0.0
-            or (carries(contact) and contact.gap > tolerance)
-        ):
-            return False
-    return True
-
-
-@kernel
-def pressed_only(count: int, contacts: Records) -> int:
-    """Drop the contacts that carry nothing; returns how many are left."""
-    n = 0
-    for c in range(count):
-        if carries(contacts[c]):
-            if n != c:
-                contacts[n] = contacts[c]
-            n += 1
     return n
 
 
@@ -367,9 +329,7 @@ def add_walls(
                 known = known or (same and dot(normal_of(contacts[e]), normal) > _SAME_WALL)
             if not known:
                 gap = found[j].distance - contact.radius
-                open_contact(
-                    contacts[n], k, contact.arclength, normal, gap, contact.radius, surfaces.friction[k]
-                )
+                open_contact(contacts[n], k, contact.arclength, normal, gap, contact.radius)
                 n += 1
     return n
 

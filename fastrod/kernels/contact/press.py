@@ -23,9 +23,8 @@ from fastrod.types import ContactMotion, ContactRods, ContactSet, Floats, Ints, 
 from ..jit import inline, kernel
 from ..rod.gather import pick
 from ..vec import Vec, axpy, cross, dot, scale, sub
-from .assemble import tangents
 from .bvh import Numbers, Record, normal_of
-from .centreline import curve_of, curve_slip, interval_of, point_at
+from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, tangent_at
 from .contact_set import carries, set_normal, wall_at
 from .rod_proximity import partner_of
 from .surface import surface_curvature
@@ -33,11 +32,16 @@ from .tunnelling import carried
 
 SOFT = 1e-8
 """R [m/N]: under 100 N a contact is a micrometre deep."""
-_ROUNDS, _HALVINGS = 40, 40
+_FEW, _ROUNDS, _HALVINGS = 6, 40, 40
+_SOFTEST, _HARDENS = 1e6, 0.1  # of R, in so many times less each
+_ROUGHLY = 1e-4  # of the unknowns, where contacts are softer than they are
 _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
 _TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
+_DAMPS, _STIFFENS, _MOST_DAMPED = 0.1, 8.0, 1e6
+"""Part of its diagonal that is added to a Hessian with a negative pivot: first, times that, and at most."""
+_AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
 _RENEWED = 5e-6  # m: a slip that changes by less is kept for the next pass
 
 
@@ -60,6 +64,11 @@ class PressedWorld(NamedTuple):
     """(n_contacts, 5) mu, R, t (2), s."""
     curved: Floats
     """(n_contacts, 3, 3) second derivative of the gap by the place, along the axes [1/m]."""
+    shift: Floats
+    """(n_contacts, 2, n) change by the unknowns of the gap's slope along the rod, and along the other."""
+    yields: Floats
+    """(n_contacts, 3) inverse of the second derivative of the gap along both, (1, 1), (1, 2), (2, 2): how far
+    the place where it is least moves; 0 where it does not [m]."""
     matrix: Floats
     """(n, n)"""
     step: Floats
@@ -81,10 +90,21 @@ class Touching(NamedTuple):
     """(n_robots, n_q) with these."""
     change: Floats
     """(n_robots, n_points, 3, n_q) motion of points by the unknowns, world."""
+    turn: Floats
+    """(n_robots, n_points, 3, n_q) and of the tangents there."""
     first: int
     """Number of the first contact among these points."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
+
+
+@inline
+def tangents(n: Vec) -> tuple[Vec, Vec]:
+    """Two directions that make a right-handed frame with n."""
+    helper = (1.0, 0.0, 0.0) if abs(n[0]) < 0.6 else (0.0, 1.0, 0.0)
+    t = cross(n, helper)
+    t = scale(1.0 / math.sqrt(dot(t, t)), t)
+    return t, cross(n, t)
 
 
 @inline
@@ -101,7 +121,7 @@ def _place(i: int, s: float, motion: ContactMotion) -> tuple[Vec, int]:
 
 @inline
 def _place_before(i: int, s: float, near: int, motion: ContactMotion) -> Vec:
-    before = curve_slip(motion, i)
+    before = curve_before(motion, i)
     j, fraction = interval_of(before, s, near)
     return point_at(before, j, fraction)
 
@@ -181,6 +201,110 @@ def _add_motion(
         for r in range(3):
             moved = axes[r, 0] * change[0, a] + axes[r, 1] * change[1, a] + axes[r, 2] * change[2, a]
             pressing.along[m, r, row * n_q + a] += sign * moved
+
+
+@inline
+def _slides_along(i: int, s: float, all_of_it: Touching) -> bool:
+    """The place of a contact may move both ways along rod i."""
+    curve, some = curve_of(all_of_it.motion, i), 1e-6 * all_of_it.rods.length[i]
+    return bool(all_of_it.rods.first[i] + some < s < curve.arclength[len(curve.arclength) - 1] - some)
+
+
+@kernel
+def _note_shift(
+    m: int, side: int, row: int, i: int, q: int, n: int, all_of_it: Touching, pressing: PressedWorld
+) -> Vec:
+    """Row `side` of the shift of contact m, point q of rod i; its tangent there along the axes."""
+    axes, curved, out = pressing.axes[m], pressing.curved[m], pressing.shift[m, side]
+    curve, sign = curve_of(all_of_it.motion, i), 1.0 if side == 0 else -1.0
+    j, x = interval_of(curve, all_of_it.contacts.contact[i, q].arclength, 0)
+    along = tangent_at(curve, j, x)
+    t = (dot(along, _axis(axes, 0)), dot(along, _axis(axes, 1)), dot(along, _axis(axes, 2)))
+    n_q, turn = all_of_it.change.shape[3], all_of_it.turn[i, all_of_it.first + q]
+    for a in range(n):
+        value = 0.0
+        for r in range(1, 3):
+            for c in range(1, 3):
+                value += t[r] * curved[r, c] * pressing.along[m, c, a]
+        out[a] = sign * value
+    for a in range(n_q):
+        turned = axes[0, 0] * turn[0, a] + axes[0, 1] * turn[1, a] + axes[0, 2] * turn[2, a]
+        out[row * n_q + a] += sign * turned
+    return t
+
+
+@kernel
+def _second_along(t: Vec, other: Vec, m: int, pressing: PressedWorld) -> float:
+    """t . C other, tangents along the axes of contact m."""
+    curved, value = pressing.curved[m], 0.0
+    for r in range(1, 3):
+        for c in range(1, 3):
+            value += t[r] * curved[r, c] * other[c]
+    return value
+
+
+@kernel
+def _bend_across(i: int, q: int, m: int, all_of_it: Touching, pressing: PressedWorld) -> float:
+    """n . d2r/ds2 at point q of rod i."""
+    curve = curve_of(all_of_it.motion, i)
+    j, x = interval_of(curve, all_of_it.contacts.contact[i, q].arclength, 0)
+    return dot(bend_at(curve, j, x), _axis(pressing.axes[m], 0))
+
+
+@kernel
+def _let_slide(
+    m: int,
+    row: tuple[int, int],
+    i: int,
+    q: int,
+    other: int,
+    partner: int,
+    n: int,
+    all_of_it: Touching,
+    pressing: PressedWorld,
+) -> None:
+    """How the place of contact m moves along the rods with the unknowns: where the gap is least, its slopes
+    along them are 0. Not where that is nearly everywhere: on what is as curved as the rod."""
+    contact, yields, least = all_of_it.contacts.contact, pressing.yields[m], 1.0 / all_of_it.rods.length[i]
+    yields[0], yields[1], yields[2] = 0.0, 0.0, 0.0
+    here = _slides_along(i, contact[i, q].arclength, all_of_it)
+    t = _note_shift(m, 0, row[0], i, q, n, all_of_it, pressing)
+    first = _bend_across(i, q, m, all_of_it, pressing) + _second_along(t, t, m, pressing)
+    near = _AT_LEAST * all_of_it.rods.spacing[i]
+    here = here and first > least and abs(t[0]) < near * first
+    if here:
+        yields[0] = 1.0 / first
+    if other < 0:
+        return
+    there = _slides_along(other, contact[other, partner].arclength, all_of_it)
+    u = _note_shift(m, 1, row[1], other, partner, n, all_of_it, pressing)
+    second = _second_along(u, u, m, pressing) - _bend_across(other, partner, m, all_of_it, pressing)
+    mixed = -_second_along(t, u, m, pressing)
+    if not (there and second > least and abs(u[0]) < near * second):
+        return
+    if not here:
+        yields[2] = 1.0 / second
+        return
+    det = first * second - mixed * mixed
+    if det > least * max(first, second):
+        yields[0], yields[1], yields[2] = second / det, -mixed / det, first / det
+
+
+@kernel
+def _add_slides(m: int, n: int, contacts: ContactSet, pressing: PressedWorld) -> None:
+    """Add to the Hessian that the least gap is less than that at a place which stays."""
+    for k in range(m):
+        axes, yields, shift = pressing.axes[k], pressing.yields[k], pressing.shift[k]
+        force = contacts.contact[pressing.side[k, 0], pressing.side[k, 1]].force
+        pressed = force[0] * axes[0, 0] + force[1] * axes[0, 1] + force[2] * axes[0, 2]
+        rubs = pressing.law[k, 0] > 0.0  # what sticks stays where it is
+        if not pressed > 0.0 or rubs or yields[0] + yields[2] == 0.0:
+            continue
+        for a in range(n):
+            one = pressed * (yields[0] * shift[0, a] + yields[1] * shift[1, a])
+            other = pressed * (yields[1] * shift[0, a] + yields[2] * shift[1, a])
+            for b in range(n):
+                pressing.hessian[a, b] += one * shift[0, b] + other * shift[1, b]
 
 
 @kernel
@@ -282,6 +406,9 @@ def gather_world(
                 at = n + 6 * _body_of(k, surfaces)
                 place, _ = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
+            for a in range(most):
+                pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
+            _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
             force = contact.force
             for r in range(3):
                 pressed = axes[r, 0] * force[0] + axes[r, 1] * force[1] + axes[r, 2] * force[2]
@@ -452,18 +579,35 @@ def _rotate_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
 
 
 @kernel
-def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
-    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
-    changed, where it may (`renew`)."""
-    step, to, trial = pressing.step, pressing.room[0], pressing.room[1]
+def _scale_softness(m: int, pressing: PressedWorld, by: float) -> None:
+    for k in range(m):
+        pressing.law[k, 1] *= by
+
+
+@kernel
+def _make_convex(
+    n: int, m: int, contacts: ContactSet, pressing: PressedWorld, turned: bool, damping: float
+) -> None:
+    """Take from a Hessian with a negative pivot what the forces turn with their surfaces, or else add to its
+    diagonal."""
+    if turned:
+        _rotate_forces(m, n, contacts, pressing, -1.0)
+        return
     for a in range(n):
-        step[a] = 0.0
-    turned = _rotate_forces(m, n, contacts, pressing, 1.0)
-    for _ in range(_ROUNDS):
-        if not _newton_step(m, n, pressing, to) and turned:
-            _rotate_forces(m, n, contacts, pressing, -1.0)
-            turned = False
-            _newton_step(m, n, pressing, to)
+        pressing.hessian[a, a] += damping * abs(pressing.hessian[a, a])
+
+
+@kernel
+def _minimise(
+    m: int, n: int, contacts: ContactSet, pressing: PressedWorld, turned: bool, rounds: int, small: float
+) -> tuple[bool, bool]:
+    """Newton's method from the present step until one changes it by less than `small` of itself: whether it
+    has ended, and whether the forces still turn with their surfaces."""
+    step, to, trial, damping = pressing.step, pressing.room[0], pressing.room[1], _DAMPS
+    for _ in range(rounds):
+        while not _newton_step(m, n, pressing, to) and damping < _MOST_DAMPED:
+            _make_convex(n, m, contacts, pressing, turned, damping)
+            damping, turned = damping if turned else _STIFFENS * damping, False
         low, high, fraction = 0.0, 1.0, 1.0
         first = abs(_slope_along(m, n, pressing, step, to))
         for _ in range(_HALVINGS):
@@ -478,8 +622,32 @@ def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: b
         for a in range(n):
             step[a] += fraction * to[a]
             size, largest = max(size, abs(fraction * to[a])), max(largest, abs(step[a]))
-        if not size > _SMALL * max(1.0, largest):
-            break
+        if not size > small * max(1.0, largest):
+            return True, turned
+    return False, turned
+
+
+@kernel
+def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool, still: bool) -> bool:
+    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
+    changed, where it may (`renew`). `still`: contacts stay where they are. Where Newton's method takes long (many contacts slip, in directions that
+    they have yet to find), contacts are soft first."""
+    for a in range(n):
+        pressing.step[a] = 0.0
+    if not still:
+        _add_slides(m, n, contacts, pressing)
+    turned = _rotate_forces(m, n, contacts, pressing, 1.0)
+    ended, turned = _minimise(m, n, contacts, pressing, turned, _FEW, _SMALL)
+    if not ended:
+        for a in range(n):
+            pressing.step[a] = 0.0
+        softer = _SOFTEST
+        while softer > 1.0:
+            _scale_softness(m, pressing, softer)
+            _, turned = _minimise(m, n, contacts, pressing, turned, _ROUNDS, _ROUGHLY)
+            _scale_softness(m, pressing, 1.0 / softer)
+            softer *= _HARDENS
+        _minimise(m, n, contacts, pressing, turned, _ROUNDS, _SMALL)
     return _report_forces(m, n, contacts, pressing, renew)
 
 

@@ -19,6 +19,7 @@ from .centreline import Curve, curve_of, interval_of, point_at, tangent_at
 from .contact_set import open_contact, segment_at
 
 _ROUNDS = 12  # of Newton's method, which doubles the digits of the chords' answer at each
+_SIDE_BY_SIDE = 1e-3  # sine of the angle between, squared
 
 
 class RodSearch(NamedTuple):
@@ -30,6 +31,8 @@ class RodSearch(NamedTuple):
     n_obstacles: int
     margin: float
     """Gap below which a minimum is a contact, as a fraction of the rod's length."""
+    closer: float
+    """By how much the gap must be smaller for a contact to move there [m]."""
 
 
 class Nearest(NamedTuple):
@@ -66,13 +69,13 @@ def _clamp(x: float) -> float:
 
 
 @kernel
-def _closest_on_chords(p: Vec, u: Vec, q: Vec, v: Vec) -> tuple[float, float]:
-    """Fractions of the closest points of p + s u and q + t v (Ericson, Real-Time Collision Detection,
-    5.1.9)."""
+def _closest_on_chords(p: Vec, u: Vec, q: Vec, v: Vec, still: float) -> tuple[float, float]:
+    """Fractions of the closest points of p + s u and q + t v (Ericson, Real-Time Collision Detection, 5.1.9);
+    of chords that are side by side, where any pair is as near, that at s = `still`."""
     e = sub(p, q)
     a, b, c, d, f = dot(u, u), dot(u, v), dot(v, v), dot(u, e), dot(v, e)
     det = a * c - b * b
-    s = _clamp((b * f - c * d) / det) if det > 1e-14 * a * c else 0.5
+    s = _clamp((b * f - c * d) / det) if det > _SIDE_BY_SIDE * a * c else still
     t = (b * s + f) / c
     if t < 0.0:
         s, t = _clamp(-d / a), 0.0
@@ -90,14 +93,10 @@ def _nearest_on_curves(a: Curve, b: Curve, s: float, t: float, low_a: float, low
         i, x = interval_of(a, s, 0)
         j, y = interval_of(b, t, 0)
         e = sub(point_at(a, i, x), point_at(b, j, y))
-        u, v = tangent_at(a, i, x), tangent_at(b, j, y)
-        ga, gb, w = dot(e, u), -dot(e, v), dot(u, v)
-        det = 1.0 - w * w
-        if det > 1e-3:
-            ds, dt = -(ga + w * gb) / det, -(gb + w * ga) / det
-        else:  # side by side: any pair along them is as near
-            ds, dt = -0.5 * ga, -0.5 * gb
-        new_s, new_t = min(max(s + ds, low_a), end_a), min(max(t + dt, low_b), end_b)
+        u, v = scale(end_a - low_a, tangent_at(a, i, x)), scale(end_b - low_b, tangent_at(b, j, y))
+        x, y = (s - low_a) / (end_a - low_a), (t - low_b) / (end_b - low_b)
+        x, y = _closest_on_chords(axpy(-x, u, e), u, scale(-y, v), v, x)  # of the tangents
+        new_s, new_t = low_a + x * (end_a - low_a), low_b + y * (end_b - low_b)
         moved = abs(new_s - s) + abs(new_t - t)
         s, t = new_s, new_t
         if moved < 1e-12:
@@ -143,7 +142,7 @@ def _add_pair(robot: int, other: int, near: Nearest, gap: float, search: RodSear
         s, n = (near.s, near.normal) if i == 0 else (near.t, scale(-1.0, near.normal))
         new = contact[which, used[which]]
         radius = _radius_at(which, s, search)
-        open_contact(new, search.n_obstacles + touched, s, n, gap, radius, search.rods.friction)
+        open_contact(new, search.n_obstacles + touched, s, n, gap, radius)
         new.partner = link
         used[which] += 1
     return True
@@ -160,7 +159,7 @@ def _hold_nearest(robot: int, other: int, near: Nearest, search: RodSearch, add:
     if known >= 0:
         contact = search.contacts.contact[robot, known]
         violated = min(0.0, contact.gap) - gap
-        if add and gap < contact.gap - 1e-10:
+        if add and gap < contact.gap - search.closer:
             contact.arclength = near.s
             partner = partner_of(search.contacts, search.n_obstacles, robot, known)
             search.contacts.contact[other, partner].arclength = near.t
@@ -207,7 +206,7 @@ def _search_pair(robot: int, other: int, search: RodSearch, add: bool) -> float:
                 while j < n - 1 and b.arclength[j + 1] < s:
                     j += 1
                 continue
-            x, y = _closest_on_chords(p, u, q, v)
+            x, y = _closest_on_chords(p, u, q, v, 0.5)
             s_chord, t_chord = a.arclength[i] + x * h_a, b.arclength[j] + y * h_b
             near = _nearest_on_curves(a, b, s_chord, t_chord, rods.first[robot], rods.first[other])
             here = abs(near.s - s_chord) < 2.0 * h_a and abs(near.t - t_chord) < 2.0 * h_b

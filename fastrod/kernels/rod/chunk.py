@@ -10,7 +10,7 @@ the base of each segment, with u_z = 0 there, and the residuals are the lengths 
 
 from __future__ import annotations
 
-from fastrod.types import Layout, PointLoads, Ports
+from fastrod.types import Layout, Ports
 
 from ..jit import inline, kernel
 from ..vec import mul
@@ -20,14 +20,12 @@ from .boundary import (
     close_lengths,
     close_tip,
     correct_with_kept_gain,
-    form_gain,
     note_inputs,
     release_slack_tendons,
     update_boundary,
 )
 from .gather import gather_base, gather_segment, gather_step, pick, predict, scatter, scatter_node
 from .lanes import Lanes, W, at, clear, get, get_mat, put, read, write
-from .point_loads import arrive, leave, load_base, load_column, respond
 from .workspace import (
     Batch,
     Chunk,
@@ -89,16 +87,7 @@ def finish_stages(rod: RodLanes, first: int, n: int, loaded: bool, iterations: i
 
 
 @kernel
-def march_columns(
-    k: int,
-    j: int,
-    with_positions: bool,
-    layout: Layout,
-    rod: RodLanes,
-    sens: Sensitivities,
-    loads: PointLoads,
-    chunk: Chunk,
-) -> None:
+def march_columns(k: int, with_positions: bool, layout: Layout, rod: RodLanes, sens: Sensitivities) -> None:
     """Move every column over step j of segment k and add its part of the tendon lengths."""
     node, stages, _, paths = rod
     change = sens.change
@@ -106,7 +95,7 @@ def march_columns(
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     n_free = len(layout.free_tendon)
     nothing = paths[n * sh.PATHS * W :]  # after the last tendon all is zero
-    for c in range(sens.moves.n_columns):
+    for c in range(sens.n_col):
         if layout.paper and c < n_base and c // 2 > k:
             continue  # its segment has not begun
         tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else n
@@ -114,9 +103,6 @@ def march_columns(
         axis = c - n_base - n_free
         # R^T e_axis is a row of R
         load = node[(sh.N_R + 3 * axis) * W :] if 0 <= axis < 3 else nothing
-        if loads.node.shape[1] > 0 and c >= sens.n_x:
-            load_column(c - sens.n_x, k * layout.n_steps + j, node, loads, chunk, sens.unit_force)
-            load = sens.unit_force
         column = sens.columns[c * col.COLUMN * W :]
         col.step_column(column, node, stages, drive, load)
         if with_positions:
@@ -193,10 +179,9 @@ def add_base_moment(node: Lanes, wrench: Lanes, sign: float) -> None:
 def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
     """Integrate from base to tip: the rod, the tendons' lengths and the columns."""
     params, ports, layout, memory = batch
-    rod, sens, n, loads = work.rod, work.sens, work.size.tendons, output.loads
+    rod, sens, n = work.rod, work.sens, work.size.tendons
     node, start = rod.node, rod.node[sh.N_K * W :]
     dense, differentiated = len(output.shape.position) > 0, len(output.response.tip) > 0
-    loaded = loads.node.shape[1] > 0
     varied, iterations = _is_varied(ports), RESPONSE_ITERATIONS if differentiated else ITERATIONS
     for k in range(params.length.shape[1]):
         first = layout.first_tendon[k]
@@ -210,8 +195,6 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode:
                 start_segment(k, layout, node, work.x, sens.columns, mode.n_col)
                 if k == 0 or layout.paper:
                     add_base_moment(node, work.wrench, 1.0)
-            if loaded:
-                leave(at_node, loads, chunk, node, sens.columns, work.size.x, mode.n_col)
             sh.start_step(node, rod.stages)
             own = FIRST_ITERATIONS if j == 0 else iterations
             solve_section(start, rod.stages, rod.tendon, rod.paths, first, n, pulled, own)
@@ -225,11 +208,9 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode:
             finish_stages(rod, first, n, pulled, iterations)
             for g in range(first, n, sh.GROUP):
                 sh.add_lengths(work.length[g * W :], node, rod.paths[g * sh.PATHS * W :])
-            if mode.update or differentiated or loaded:
-                march_columns(k, j, differentiated or loaded, layout, rod, sens, loads, chunk)
+            if mode.update or differentiated:
+                march_columns(k, differentiated, layout, rod, sens)
             sh.advance(node, rod.stages)
-            if loaded:
-                arrive(at_node + 1, loads, chunk, node, sens)
             for w in range(W):
                 write(work.s, 0, w, read(work.s, 0, w) + read(node, sh.N_H, w))
         if layout.paper:
@@ -237,13 +218,11 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode:
 
 
 @inline
-def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
+def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace) -> None:
     """Add what lies beyond the last step: loads on the tip, and the cross-section there."""
     params, layout, rod = batch.params, batch.layout, work.rod
-    n, n_segments, loads = work.size.tendons, params.length.shape[1], output.loads
+    n, n_segments = work.size.tendons, params.length.shape[1]
     tip = n_segments * layout.n_steps
-    if loads.node.shape[1] > 0:
-        leave(tip, loads, chunk, rod.node, work.sens.columns, work.size.x, mode.n_col)
     if len(output.shape.position) > 0:
         first, end = layout.first_tendon[n_segments - 1], rod.node[(sh.N_K + 6) * W :]
         iterations = RESPONSE_ITERATIONS if len(output.response.tip) > 0 else ITERATIONS
@@ -315,34 +294,24 @@ def write_response(chunk: Chunk, output: Output, work: PassWorkspace) -> None:
 
 @kernel
 def pass_chunk(chunk: Chunk, batch: Batch, output: Output, scratch: Lanes, mode: Mode) -> None:
-    """One observer pass of the robots of a chunk.
-
-    With point loads the boundary is not updated: how it would be, and how the contact points then move, is
-    written to the loads.
-    """
-    n_loads = output.loads.node.shape[1]
+    """One observer pass of the robots of a chunk."""
     params, ports, layout, memory = batch
-    work = carve(scratch, sizes(batch, n_loads, mode.n_col))
+    work = carve(scratch, sizes(batch, mode.n_col))
     if mode.predict:
         predict(chunk.robots, chunk.n_robots, ports, params, memory, layout)
     load_unknowns(chunk, batch, work.x, work.rod.tendon)
     gather_base(chunk.robots, ports, params, memory, layout, work.rod.node, work.x)
-    if n_loads > 0:
-        load_base(output.loads, chunk, work.rod.node)
     clear(work.s)
     clear(work.wrench)
     for w in range(W):
         put(work.wrench, 0, w, get(work.rod.node, sh.N_N, w))
     march(chunk, batch, output, work, mode)
-    finish_tip(chunk, batch, output, work, mode)
+    finish_tip(chunk, batch, output, work)
     close(chunk, batch, work)
     write_summary(chunk, output, work)
     if len(output.response.tip) > 0:
         write_response(chunk, output, work)
-    if n_loads > 0:
-        form_gain(chunk, batch, work, mode)
-        respond(chunk, batch, output, work)
-    elif mode.update:
+    if mode.update:
         if mode.n_col > 0:
             update_boundary(chunk, batch, work, mode)
         else:

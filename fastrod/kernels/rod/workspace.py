@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fastrod.types import Layout, Memory, Params, PointLoads, Ports, Response, RodShape
+from fastrod.types import Layout, Memory, Params, Ports, Response, RodShape
 
 from ..jit import LANES, inline
 from . import columns as col
@@ -29,8 +29,6 @@ class Chunk(NamedTuple):
     """(LANES,) index of each lane's robot; the lanes beyond the last robot repeat it."""
     n_robots: int
     """At most LANES."""
-    first_row: int
-    """Row of the first one in `PointLoads`."""
 
 
 class Output(NamedTuple):
@@ -38,7 +36,6 @@ class Output(NamedTuple):
 
     shape: RodShape
     response: Response
-    loads: PointLoads
 
 
 class Mode(NamedTuple):
@@ -82,8 +79,6 @@ class Size(NamedTuple):
     """Residuals."""
     col: int
     """Columns."""
-    loads: int
-    """Point loads."""
     p: int
     """Unknowns, rounded up to whole blocks of `observer`."""
 
@@ -100,16 +95,11 @@ class RodLanes(NamedTuple):
 class Sensitivities(NamedTuple):
     """Sensitivities that are integrated along with the rod, for every column."""
 
-    n_x: int
-    """Columns of unknowns; those of loads follow."""
+    n_col: int
     columns: Lanes
     """(n_col, COLUMN) fields (`columns`)."""
     change: LaneMatrix
     """(n_col, n_tendons + GROUP) change of the tendons' lengths."""
-    unit_force: Lanes
-    """(3,) the force of the column at work."""
-    moves: LaneMatrix
-    """(3 n_loads, n_col) motion of the contact points."""
 
 
 class PassWorkspace(NamedTuple):
@@ -147,21 +137,20 @@ def padded(n: int, block: int) -> int:
     return block * ((n + block - 1) // block)
 
 
-def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int, n_loads: int = 0) -> int:
+def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
     """Numbers of scratch that `pass_chunk` needs."""
     n_t, n_p = n_tendons + sh.GROUP, BLOCK * -(-n_x // BLOCK)
     march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + sh.PATHS + 1) + n_col * (col.COLUMN + n_t)
-    loads = 3 + 3 * n_loads * n_col
-    return LANES * (march + 7 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x + loads)
+    return LANES * (march + 7 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x)
 
 
 @inline
-def sizes(batch: Batch, n_loads: int, n_col: int) -> Size:
+def sizes(batch: Batch, n_col: int) -> Size:
     """Counts of this pass."""
     layout, n_x = batch.layout, batch.memory.x.shape[1]
     n_e = len(layout.row_tendon) + (0 if layout.paper else 3)
     n_e += 3 if len(batch.ports.follower_force) > 0 else 0
-    return Size(len(layout.tendon_segment), n_x, n_e, n_col, n_loads, padded(n_x, BLOCK))
+    return Size(len(layout.tendon_segment), n_x, n_e, n_col, padded(n_x, BLOCK))
 
 
 @inline
@@ -184,8 +173,6 @@ def carve(scratch: Lanes, size: Size) -> PassWorkspace:
     covariance, o = take(scratch, o, n_p * n_p)
     gain, o = take(scratch, o, n_e * n_p)
     scaled, o = take(scratch, o, n_e * n_p)
-    unit_force, o = take(scratch, o, 3)
-    moves, o = take(scratch, o, 3 * size.loads * n_col)
     vector, o = take(scratch, o, n_p + 2)
     units, o = take(scratch, o, size.x)
     clear(length)
@@ -193,11 +180,10 @@ def carve(scratch: Lanes, size: Size) -> PassWorkspace:
     clear(change)
     clear(paths)
     clear(tendon)
-    clear(moves)
     return PassWorkspace(
         size,
         RodLanes(node, stages, tendon, paths),
-        Sensitivities(size.x, columns, LaneMatrix(change, n_t), unit_force, LaneMatrix(moves, n_col)),
+        Sensitivities(n_col, columns, LaneMatrix(change, n_t)),
         length,
         x,
         error,

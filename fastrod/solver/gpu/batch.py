@@ -18,7 +18,7 @@ from numba import cuda
 
 from fastrod.kernels.rod.workspace import Mode
 from fastrod.solver.gpu.kernels.jit import SIMULATED, launched
-from fastrod.types import Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
+from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Response, RodShape
 
 _cuda: Any = cuda
 _config: Any = numba.config
@@ -54,14 +54,10 @@ def pass_robots(size: int) -> Any:
     ) -> None:
         scratch = _cuda.local.array(size, np.float64)
         robots = _cuda.local.array(1, np.int64)
-        # slices of length 0 of what the compiler then leaves out, and with it all that contact would do
-        none = _cuda.local.array((1, 1), np.int64)[:, :0]
-        nothing = _cuda.local.array((1, 1, 1), np.float64)[:, :0]
-        loads = PointLoads(none, nothing, nothing, nothing, nothing)
-        batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
+        batch, output = Batch(params, ports, layout, memory), Output(shape, response)
         for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
             robots[0] = rows[r]
-            pass_chunk(Chunk(robots, 1, 0), batch, output, scratch, mode)
+            pass_chunk(Chunk(robots, 1), batch, output, scratch, mode)
 
     return launched(run)
 

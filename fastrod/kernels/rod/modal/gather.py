@@ -72,6 +72,8 @@ class ModalPoints(NamedTuple):
     """(n_robots, n_points)"""
     row: Floats
     """(n_robots, n_points, N + 1) rows of the integration there."""
+    slope: Floats
+    """(n_robots, n_points, N + 1) Lagrange polynomials of the nodes there."""
     force: Floats
     """(n_robots, n_points, 3) world [N]."""
 
