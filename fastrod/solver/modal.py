@@ -165,8 +165,8 @@ def _inertia(density: float, radius: float) -> tuple[float, float, float]:
 def no_points(n_robots: int) -> ModalPoints:
     """No point force."""
     n_nodes = N_INTERVALS + 1
-    row = np.zeros((n_robots, 0, n_nodes))
-    return ModalPoints(np.zeros((n_robots, 0), np.int64), row, row.copy(), np.zeros((n_robots, 0, 3)))
+    row, force = np.zeros((n_robots, 0, n_nodes)), np.zeros((n_robots, 0, 3))
+    return ModalPoints(np.zeros((n_robots, 0), np.int64), row, row.copy(), force, force.copy())
 
 
 _LEAK = 1e-9
@@ -240,7 +240,7 @@ class ModalSolver:
         self.params = acting.params
         gravity = self.gravity if acting.gravity is None else acting.gravity
         self.pieces = self.pieces._replace(gravity=gravity)
-        self.place_points(*acting.points, acting.ports.extension)
+        self.place_points(acting.points, acting.ports.extension)
 
     def bend_as(self, rows: Ints, shape: RodShape, ports: Ports) -> None:
         """Let the curvature of these robots be nearest to that of a shape, by least squares."""
@@ -412,14 +412,14 @@ class ModalSolver:
             "inertia": (m,),
             "point": (n_points, 3),
             "point_change": (n_points, 3, n_q),
-            "tangent_change": (n_points, 3, n_q),
+            "point_turn": (n_points, 3, n_q),
         }
         left_out = {"hessian", "mass", "damping", "number", "point"} - set(wanted)
         left_out -= {"number"} if followed else set()
         if "number" in left_out:
             left_out |= {"number_change", "inertia"}
         if "point" in left_out:
-            left_out |= {"point_change", "tangent_change"}
+            left_out |= {"point_change", "point_turn"}
         found = ModalDerivatives(
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )
@@ -449,9 +449,11 @@ class ModalSolver:
             self._work = size, modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
         return self._work[1]
 
-    def place_points(self, arclength: Floats, force: Floats, extension: Floats) -> None:
-        """Point forces (1 or n_robots, n_points, 3) [N] at arclengths (1 or n_robots, n_points) [m]."""
-        n, m = self.n_robots, arclength.shape[1]
+    def place_points(self, points: tuple[Floats, ...], extension: Floats) -> None:
+        """Arclengths (1 or n_robots, n_points) [m] of point forces (1 or n_robots, n_points, 3) [N], and of as
+        many moments [N m], where these are given."""
+        n, (arclength, force) = self.n_robots, points[:2]
+        m = arclength.shape[1]
         if not m:
             self.points = no_points(n)
             return
@@ -469,6 +471,7 @@ class ModalSolver:
             integral_row(x - inside),
             lagrange_row(x - inside),
             np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
+            points[2] if len(points) > 2 else np.zeros((n, m, 3)),
         )
 
     def new_motion_shape(self, outputs: Literal["full", "tip"]) -> MotionShape:

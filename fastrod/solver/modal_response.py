@@ -30,7 +30,7 @@ class ModalLinear:
     modal: ModalSolver
     rows: Ints
     ports: Ports
-    points: tuple[Floats, Floats]
+    points: tuple[Floats, ...]
     """Point forces at their arclengths: (n_robots, m) [m] and (n_robots, m, 3) [N]."""
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
@@ -73,11 +73,11 @@ class ModalLinear:
             moved[:, column] += sign * delta
             more: dict[str, Any] = {name: moved}
             if name == "extension":
-                self.modal.place_points(*self.points, moved)
+                self.modal.place_points(self.points, moved)
                 more |= {} if relocate is None else dict(relocate(moved))
             sides.append(self.modal.derive(self.rows, self.ports._replace(**more), wanted=()))
         if name == "extension":
-            self.modal.place_points(*self.points, self.ports.extension)
+            self.modal.place_points(self.points, self.ports.extension)
         return _difference(sides, delta)
 
     def _by_rotation(self, axis: int) -> tuple[Floats, Floats]:

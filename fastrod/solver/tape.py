@@ -386,7 +386,7 @@ class Twin:
         found = []
         for reader, modal in self._sides:
             ports = reader.ports(event.acting.given)
-            modal.place_points(*reader.loads, ports.extension)
+            modal.place_points(reader.loads, ports.extension)
             gravity = modal.gravity if reader.gravity is None else reader.gravity
             modal.pieces = modal.pieces._replace(gravity=gravity)
             found.append(at_solution(modal, balance, ports))

@@ -322,6 +322,7 @@ class TouchingRods(ModalRods):
                 np.maximum(deep, -engine.clearance.gap, out=deep)
             if count and not self.dynamics:  # it is led there by a shorter way
                 gone = engine.whole_worlds(through)
+                self._note_nearest(left[gone[left]], near[gone[left]], n_found[gone[left]])
                 left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]
             busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
             ok |= self._mask(left) & ~engine.whole_worlds(busy & self._mask(left))
@@ -335,17 +336,10 @@ class TouchingRods(ModalRods):
             if engine.rods_meet:
                 closer = 0.1 * _INSIDE if still else _SAME_GAP
                 search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
-            modal.place_points(*self._points(left, acting), ports.extension)
+            modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
             yielding = (how.dt / self.stepper.time.dt) ** 2 if self.dynamics else 1.0
-            model = (
-                d.hessian,
-                d.gradient,
-                d.point_change,
-                d.tangent_change,
-                acting.points[0].shape[1],
-                yielding,
-            )
+            model = (d.hessian, d.gradient, d.point_change, d.point_turn, acting.points[0].shape[1], yielding)
             self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
             q[left] += step[left]
             size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
@@ -354,18 +348,18 @@ class TouchingRods(ModalRods):
             q[lost] = motion.q[lost]
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):
-            modal.place_points(*self._points(arrived, acting), ports.extension)
+            modal.place_points(self._points(arrived, acting), ports.extension)
             modal.hold(arrived, ports, *found, how, q, True)
             end_some(arrived, contacts)
         self._go_back(rows[~ok[rows]], then)
-        modal.place_points(*acting.points, ports.extension)
+        modal.place_points(acting.points, ports.extension)
         return ok
 
     def _note_nearest(self, rows: Ints, near: Any, n_found: Ints) -> None:
         """Note what robots without a balance were nearest to, for their sentence."""
         for i, found, n in zip(map(int, rows), near, n_found, strict=True):
             if n:
-                least = found[int(np.argmin(found["gap"][:n]))]
+                least = found[int(np.argmin(found["gap"][: abs(n)]))]
                 self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
     def _press(self, rows: Ints, given: Any) -> None:
@@ -398,11 +392,12 @@ class TouchingRods(ModalRods):
         self._take(acting)
         rows = np.flatnonzero(warm)
         points = self._points(rows, acting)
-        self.modal.place_points(*points, acting.ports.extension)
+        self.modal.place_points(points, acting.ports.extension)
         return ModalLinear(self.modal, rows, acting.ports, points)
 
-    def _points(self, rows: Ints, acting: Acting) -> tuple[Floats, Floats]:
-        """Point forces: those that are given, then the contacts of these robots."""
+    def _points(self, rows: Ints, acting: Acting) -> tuple[Floats, Floats, Floats]:
+        """Point forces: those that are given, then the contacts of these robots, whose friction acts on the
+        surface; and their moments."""
         contacts = self.engine.contact_set
         arclength, force = acting.points
         most = -(-int(contacts.used[rows].max(initial=0)) // _ROOM) * _ROOM
@@ -410,11 +405,15 @@ class TouchingRods(ModalRods):
         every = contacts.contact[:, :most]
         s = np.where(there, every["arclength"], 0.0)
         f = np.where(there[:, :, None], every["force"], 0.0)
+        moment = np.where(
+            there[:, :, None], np.cross(every["force"], every["normal"]) * every["radius"][:, :, None], 0.0
+        )
         given = arclength.shape[1]
         if given:
             s = np.concatenate([np.broadcast_to(arclength, (self.n_robots, given)), s], axis=1)
             f = np.concatenate([np.broadcast_to(force, (self.n_robots, given, 3)), f], axis=1)
-        return s, f
+            moment = np.concatenate([np.zeros((self.n_robots, given, 3)), moment], axis=1)
+        return s, f, moment
 
 
 def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:

@@ -53,7 +53,7 @@ def test_what_sticks_does_not_creep_and_what_slips_bears_all_of_its_friction() -
         force = state.contacts.total_force[0]
         assert np.hypot(force[0], force[1]) <= mu * force[2] * (1.0 + 1e-9)
         places.append(state.tip_position[0, 1])
-    assert abs(places[-1] - places[60]) < 1e-9
+    assert abs(places[-1] - places[100]) < 1e-12  # once its torsion is at rest
     for k in range(60):
         state = pressed(sim, 0.06 + 0.005 * k)
     force, slip = state.contacts.total_force[0], state.velocity[0, -1]

@@ -53,15 +53,18 @@ def search_robots(
     n_found: Ints,
     work: SearchWork,
 ) -> None:
-    """Candidates of these robots, each for the task that takes it, and its smallest gap into `motion`; -1
-    candidates where it has gone through an obstacle since the last step."""
+    """Candidates of these robots, each for the task that takes it, and its smallest gap into `motion`; -1 of
+    them where it has gone through an obstacle since the last step, which the first one names."""
     own = task_search_work(work, task)
     r = take_next(taken)
     while r < len(rows):
         i = rows[r]
-        far = motion.tracked[i] and moved_far(i, motion)
-        if far and tunnelled(i, motion, rods.first[i], surfaces, own.stack)[0] >= 0:
+        through, s = -1, 0.0
+        if motion.tracked[i] and moved_far(i, motion):
+            through, s = tunnelled(i, motion, rods.first[i], surfaces, own.stack)
+        if through >= 0:
             n_found[r], motion.gap[i] = -1, 0.0
+            found[r, 0].obstacle, found[r, 0].arclength, found[r, 0].gap = through, s, 0.0
         else:
             n_found[r], motion.gap[i] = search_obstacles(_search_of(i, rods, surfaces, motion, own, found[r]))
         r = take_next(taken)

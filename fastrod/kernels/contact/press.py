@@ -22,9 +22,9 @@ from fastrod.types import ContactMotion, ContactRods, ContactSet, Floats, Ints, 
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
-from ..vec import Vec, axpy, cross, dot, scale, sub
+from ..vec import Vec, add, axpy, cross, dot, mul, mul_t, scale, sub
 from .bvh import Numbers, Record, normal_of
-from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, tangent_at
+from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, rotation_at, tangent_at
 from .contact_set import carries, set_normal, wall_at
 from .rod_proximity import partner_of
 from .surface import surface_curvature
@@ -91,7 +91,7 @@ class Touching(NamedTuple):
     change: Floats
     """(n_robots, n_points, 3, n_q) motion of points by the unknowns, world."""
     turn: Floats
-    """(n_robots, n_points, 3, n_q) and of the tangents there."""
+    """(n_robots, n_points, 3, n_q) and rotation of the cross-sections there."""
     first: int
     """Number of the first contact among these points."""
     yielding: float
@@ -113,17 +113,23 @@ def _axis(axes: Floats, a: int) -> Vec:
 
 
 @inline
-def _place(i: int, s: float, motion: ContactMotion) -> tuple[Vec, int]:
+def _place(i: int, s: float, motion: ContactMotion) -> Vec:
     curve = curve_of(motion, i)
     j, fraction = interval_of(curve, s, 0)
-    return point_at(curve, j, fraction), j
+    return point_at(curve, j, fraction)
 
 
 @inline
-def _place_before(i: int, s: float, near: int, motion: ContactMotion) -> Vec:
-    before = curve_before(motion, i)
-    j, fraction = interval_of(before, s, near)
-    return point_at(before, j, fraction)
+def _surface_before(i: int, s: float, arm: Vec, motion: ContactMotion) -> Vec:
+    """Place at the step's start of what is now `arm` away from the centreline."""
+    now, before = curve_of(motion, i), curve_before(motion, i)
+    j, fraction = interval_of(now, s, 0)
+    rotation = rotation_at(now, j, fraction)
+    local = mul_t(rotation, arm)
+    j, fraction = interval_of(before, s, j)
+    # orthonormal to fourth order only: what has not turned is to be where it is to the last digit
+    turned = sub(mul(rotation_at(before, j, fraction), local), mul(rotation, local))
+    return add(point_at(before, j, fraction), add(arm, turned))
 
 
 @inline
@@ -140,7 +146,7 @@ def _measure_obstacle(
     """Gap and normal of a contact with an obstacle, kept in it, the second derivative of the gap, and the
     slip since the step's start (world)."""
     motion, surfaces, k = all_of_it.motion, all_of_it.surfaces, contact.obstacle
-    p, j = _place(i, contact.arclength, motion)
+    p = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
     margin = motion.margin * all_of_it.rods.length[i]
     old, last = normal_of(contact), (contact.place[0], contact.place[1], contact.place[2])
@@ -161,8 +167,9 @@ def _measure_obstacle(
             curved[a, b] = first * across + (second - first) * e[a] * e[b]
     if not motion.slides[i]:
         return 0.0, 0.0, 0.0
-    ground = carried(frame, motion.frames_slip[pick(i, len(motion.frames_slip)), k], p)
-    return sub(ground, _place_before(i, contact.arclength, j, motion))
+    arm = scale(-contact.radius, n)
+    ground = carried(frame, motion.frames_slip[pick(i, len(motion.frames_slip)), k], add(p, arm))
+    return sub(ground, _surface_before(i, contact.arclength, arm, motion))
 
 
 @kernel
@@ -170,7 +177,7 @@ def _measure_rods(
     i: int, contact: Record, other: int, partner: Record, motion: ContactMotion, curved: Floats
 ) -> Vec:
     """The same of a contact between two rods, kept in both its sides."""
-    (p, j), (r, k) = _place(i, contact.arclength, motion), _place(other, partner.arclength, motion)
+    p, r = _place(i, contact.arclength, motion), _place(other, partner.arclength, motion)
     e, old, thick = sub(p, r), normal_of(contact), contact.radius + partner.radius
     length, along = math.sqrt(dot(e, e)), dot(e, old)
     n, gap = old, along - thick
@@ -185,10 +192,12 @@ def _measure_rods(
             curved[a, b] = across / length if length > 1e-12 else 0.0
     if not (motion.slides[i] and motion.slides[other]):
         return 0.0, 0.0, 0.0
+    arm, other_arm = scale(-contact.radius, n), scale(partner.radius, n)
     before = sub(
-        _place_before(i, contact.arclength, j, motion), _place_before(other, partner.arclength, k, motion)
+        _surface_before(i, contact.arclength, arm, motion),
+        _surface_before(other, partner.arclength, other_arm, motion),
     )
-    return sub(e, before)
+    return sub(add(e, sub(arm, other_arm)), before)
 
 
 @kernel
@@ -220,6 +229,7 @@ def _note_shift(
     j, x = interval_of(curve, all_of_it.contacts.contact[i, q].arclength, 0)
     along = tangent_at(curve, j, x)
     t = (dot(along, _axis(axes, 0)), dot(along, _axis(axes, 1)), dot(along, _axis(axes, 2)))
+    across = cross(along, _axis(axes, 0))
     n_q, turn = all_of_it.change.shape[3], all_of_it.turn[i, all_of_it.first + q]
     for a in range(n):
         value = 0.0
@@ -228,7 +238,7 @@ def _note_shift(
                 value += t[r] * curved[r, c] * pressing.along[m, c, a]
         out[a] = sign * value
     for a in range(n_q):
-        turned = axes[0, 0] * turn[0, a] + axes[0, 1] * turn[1, a] + axes[0, 2] * turn[2, a]
+        turned = across[0] * turn[0, a] + across[1] * turn[1, a] + across[2] * turn[2, a]
         out[row * n_q + a] += sign * turned
     return t
 
@@ -305,6 +315,44 @@ def _add_slides(m: int, n: int, contacts: ContactSet, pressing: PressedWorld) ->
             other = pressed * (yields[1] * shift[0, a] + yields[2] * shift[1, a])
             for b in range(n):
                 pressing.hessian[a, b] += one * shift[0, b] + other * shift[1, b]
+
+
+@kernel
+def _add_arm(
+    m: int, row: int, i: int, q: int, sign: float, all_of_it: Touching, pressing: PressedWorld
+) -> None:
+    """Friction acts on the surface: add to the motion of contact m along it that of the arm from the
+    centreline there, A = - radius n, which turns with the rod."""
+    axes, contact, n_q = pressing.axes[m], all_of_it.contacts.contact[i, q], all_of_it.change.shape[3]
+    turn, n = all_of_it.turn[i, all_of_it.first + q], normal_of(contact)
+    arm, force = scale(-contact.radius, n), (contact.force[0], contact.force[1], contact.force[2])
+    rubs = axpy(-dot(force, n), n, force)
+    for r in range(1, 3):
+        across = cross(arm, _axis(axes, r))
+        for a in range(n_q):
+            turned = across[0] * turn[0, a] + across[1] * turn[1, a] + across[2] * turn[2, a]
+            pressing.along[m, r, row * n_q + a] += sign * turned
+    if dot(rubs, rubs) > 0.0:
+        _add_arm_stiffness(row, n_q, turn, arm, rubs, pressing)
+
+
+@kernel
+def _add_arm_stiffness(row: int, n_q: int, turn: Floats, arm: Vec, rubs: Vec, pressing: PressedWorld) -> None:
+    """Add to the Hessian the second derivatives of a force on an arm that turns with the rod, beyond those of
+    its moment M as a dead load, which the rod has: - f . sym (th_a x (th_b x A)), and, for rotations do not
+    commute and the rod takes th_a by the unknowns in one order, M . (th_b x th_a) / 2."""
+    moment = cross(arm, rubs)
+    for a in range(n_q):
+        one = (turn[0, a], turn[1, a], turn[2, a])
+        by_force, by_arm = dot(rubs, one), dot(arm, one)
+        for b in range(a + 1):
+            other = (turn[0, b], turn[1, b], turn[2, b])
+            more = 0.5 * (
+                dot(moment, cross(other, one)) - by_force * dot(arm, other) - by_arm * dot(rubs, other)
+            )
+            pressing.hessian[row * n_q + a, row * n_q + b] += more
+            if b < a:
+                pressing.hessian[row * n_q + b, row * n_q + a] += more
 
 
 @kernel
@@ -404,11 +452,15 @@ def gather_world(
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
             elif surfaces.mobility[k, 0] > 0.0:
                 at = n + 6 * _body_of(k, surfaces)
-                place, _ = _place(i, contact.arclength, all_of_it.motion)
+                place = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
+            if law[0] > 0.0:
+                _add_arm(m, o, i, q, 1.0, all_of_it, pressing)
+                if other >= 0:
+                    _add_arm(m, row, other, partner, -1.0, all_of_it, pressing)
             force = contact.force
             for r in range(3):
                 pressed = axes[r, 0] * force[0] + axes[r, 1] * force[1] + axes[r, 2] * force[2]
@@ -630,8 +682,8 @@ def _minimise(
 @kernel
 def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool, still: bool) -> bool:
     """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
-    changed, where it may (`renew`). `still`: contacts stay where they are. Where Newton's method takes long (many contacts slip, in directions that
-    they have yet to find), contacts are soft first."""
+    changed, where it may (`renew`). `still`: contacts stay where they are. Where Newton's method takes long
+    (many contacts slip, in directions that they have yet to find), contacts are soft first."""
     for a in range(n):
         pressing.step[a] = 0.0
     if not still:

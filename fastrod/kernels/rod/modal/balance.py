@@ -12,6 +12,7 @@ from .fields import (
     H_D,
     H_J,
     H_LINE,
+    H_MOMENT,
     H_POS,
     I_DK,
     I_HISTORY,
@@ -70,7 +71,7 @@ def demands_of_nodes(p: int, b: ModalBasis, work: ModalWork) -> None:
             moved = sub(get(node, N_POS, w), get(history, H_POS, w))
             inertia = scale(extent * read(piece, P_RHO, w) * alpha, moved)
             put(node, N_F, w, axpy(-extent, get(history, H_LINE, w), inertia))
-            put(node, N_C, w, (0.0, 0.0, 0.0))
+            put(node, N_C, w, scale(-1.0, get(history, H_MOMENT, w)))
         for k in range(3):
             for w in range(W):
                 d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))

@@ -21,7 +21,6 @@ from .fields import (
     H_POS,
     N_POS,
     N_R,
-    N_T,
     P_L,
     P_RHO,
     P_UNEVEN,
@@ -90,8 +89,8 @@ class ModalDerivatives(NamedTuple):
     """(n_robots, n_points, 3) place of every point force, world [m]."""
     point_change: Floats
     """(n_robots, n_points, 3, n_q) its derivatives by the unknowns."""
-    tangent_change: Floats
-    """(n_robots, n_points, 3, n_q) derivatives of the tangent there, dr/ds."""
+    point_turn: Floats
+    """(n_robots, n_points, 3, n_q) rotation of the cross-section there by the unknowns."""
 
 
 @kernel
@@ -232,7 +231,7 @@ def write_lumps(
 def write_points(
     robots: Ints, n_robots: int, batch: ModalBatch, work: ModalWork, out: ModalDerivatives
 ) -> None:
-    """Place of the point forces, and the change of place and tangent by the unknowns."""
+    """Place of the point forces, and its motion and rotation by the unknowns."""
     row, n_points, n_modes = work.scratch, batch.points.piece.shape[1], work.end.shape[1]
     for w in range(n_robots):
         i = robots[w]
@@ -243,19 +242,17 @@ def write_points(
             for j in range(work.node.shape[1]):
                 row[j] = read(station, S_ROW + j, w)
             scatter(out.point[i, q], place)
-            slope, tangent = batch.points.slope[i, q], (0.0, 0.0, 0.0)
-            for j in range(work.node.shape[1]):
-                tangent = axpy(slope[j], get(work.node[p, j], N_T, w), tangent)
+            slope = batch.points.slope[i, q]
             for a in range((p + 1) * n_modes):
-                moved = _moved_by(a, p, place, row, w, batch, work)
+                moved, turned = _moved_by(a, p, place, row, w, batch, work), (0.0, 0.0, 0.0)
                 if a < p * n_modes:
-                    turned = cross(get(work.end[a // n_modes, a % n_modes], 3, w), tangent)
+                    turned = get(work.end[a // n_modes, a % n_modes], 3, w)
                 else:
-                    turned = displaced(p, a % n_modes, slope, w, batch.basis, work)
-                    turned = scale(1.0 / read(work.piece[p], P_L, w), turned)
+                    for j in range(work.node.shape[1]):
+                        turned = axpy(slope[j], get(work.column[p, a % n_modes, j], C_TH, w), turned)
                 for f in range(3):
                     out.point_change[i, q, f, a] = moved[f]
-                    out.tangent_change[i, q, f, a] = turned[f]
+                    out.point_turn[i, q, f, a] = turned[f]
 
 
 @kernel

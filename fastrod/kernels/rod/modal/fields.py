@@ -15,9 +15,9 @@ from ..lanes import LaneMatrix, Lanes, W
 # carries into the positions beyond, moment t x N + C
 N_R, N_POS, N_T, N_F, N_C, N_N, N_MU, NODE = 0, 9, 12, 15, 18, 21, 24, 27
 # given at a node: what its inertia is counted from, position and directors (`motion`), the line force
-# there, the masses of the directors that stand for its rotary inertia [kg m^2], and the two parts of the line
-# force: that of the world, and the one that follows the rod, material
-H_POS, H_D, H_LINE, H_J, H_DEAD, H_FOLLOW, HISTORY = 0, 3, 12, 15, 18, 21, 24
+# there, the masses of the directors that stand for its rotary inertia [kg m^2], the two parts of the line
+# force: that of the world, and the one that follows the rod, material; and a moment
+H_POS, H_D, H_LINE, H_J, H_DEAD, H_FOLLOW, H_MOMENT, HISTORY = 0, 3, 12, 15, 18, 21, 24, 27
 # interval: u and v at its two Gauss points, rotation vector, W (rotation at its end, world, by each component
 # of u there), the moment that it carries, its own second derivatives (6x6, lower triangle), W . Y of a
 # column; given: u* at the Gauss points, how far K is there from that of the piece, and what the rate of

@@ -15,6 +15,7 @@ from .fields import (
     H_FOLLOW,
     H_J,
     H_LINE,
+    H_MOMENT,
     I_DK,
     I_STAR,
     P_FOLLOWED,
@@ -73,9 +74,11 @@ class ModalPoints(NamedTuple):
     row: Floats
     """(n_robots, n_points, N + 1) rows of the integration there."""
     slope: Floats
-    """(n_robots, n_points, N + 1) Lagrange polynomials of the nodes there."""
+    """(n_robots, n_points, N + 1) Lagrange polynomials of the nodes there: how they share a moment."""
     force: Floats
     """(n_robots, n_points, 3) world [N]."""
+    moment: Floats
+    """(n_robots, n_points, 3) world [N m]."""
 
 
 class ModalBatch(NamedTuple):
@@ -258,8 +261,19 @@ def gather_lumps(robots: Ints, pieces: ModalPieces, work: ModalWork) -> None:
 
 @kernel
 def gather_points(robots: Ints, points: ModalPoints, work: ModalWork) -> None:
-    """Force and row of every point force, into the last stations of its piece."""
+    """Force and row of every point force, into the last stations of its piece; its moment to the nodes."""
     n = points.piece.shape[1]
+    for p in range(work.station.shape[0]):
+        for j in range(work.node.shape[1]):
+            for w in range(W):
+                put(work.history[p, j], H_MOMENT, w, (0.0, 0.0, 0.0))
+    for q in range(n):
+        for w in range(W):
+            i = robots[w]
+            moment = _vec(points.moment[i, q])
+            for j in range(work.node.shape[1]):
+                node = work.history[points.piece[i, q], j]
+                put(node, H_MOMENT, w, axpy(points.slope[i, q, j], moment, get(node, H_MOMENT, w)))
     first = work.station.shape[1] - n
     for q in range(n):
         for p in range(work.station.shape[0]):
