@@ -21,7 +21,7 @@ GONE: dict[str, str] = {
     "probes": "contact points, point loads",
     "strand strands": "rod proximity, line",
     "placing placed": "node placement, with positions",
-    "touch touches": "contact, contact iteration",
+    "touch touches": "contact",
     "mobile": "mobility",
     "stride": "step limit, step",
     "scenery": "scene arrays",

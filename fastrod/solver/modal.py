@@ -291,8 +291,8 @@ class ModalSolver:
         unknowns: Floats,
         ends: bool,
     ) -> None:
-        """Show these robots at `unknowns` (n_robots, n_q) a step further; where it `ends` there, they go on
-        from it."""
+        """Show these robots at `unknowns` (n_robots, n_q, six more where bases give way) a step further;
+        where it `ends` there, they go on from it."""
         self._run(rows, ports, shape, moving, how, None, (_NEARLY, 1, 1), how.scheme, unknowns, ends)
 
     def _run(
@@ -393,6 +393,7 @@ class ModalSolver:
         with the hessian under a line force that follows the rod, point for the point forces."""
         n, motion = self.n_robots, self.motion if step is None else step[0]
         q = motion.q if unknowns is None else unknowns
+        host = no_hosts() if step is None else self.host
         n_q, m = q.shape[1], motion.place.shape[1]
         followed = len(ports.follower_line) > 0 and "hessian" in wanted
         n_nodes = len(self.pieces.segment) * len(self.basis.node) if followed else 0
@@ -424,7 +425,7 @@ class ModalSolver:
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )
         how, jump = (Step(REST, 1.0), None) if step is None else step[1:]
-        batch = self._batch(ports, motion, no_hosts())
+        batch = self._batch(ports, motion, host)
 
         def derive_some(some: Ints, work: ModalWork) -> None:
             derive_modes(self._run_of(some, how, jump, (0.0, 1, 1), REST), batch, q, work, found)
@@ -450,8 +451,8 @@ class ModalSolver:
         return self._work[1]
 
     def place_points(self, points: tuple[Floats, ...], extension: Floats) -> None:
-        """Arclengths (1 or n_robots, n_points) [m] of point forces (1 or n_robots, n_points, 3) [N], and of as
-        many moments [N m], where these are given."""
+        """Arclengths (1 or n_robots, n_points) [m] of point forces (1 or n_robots, n_points, 3) [N], and of
+        as many moments [N m], where these are given."""
         n, (arclength, force) = self.n_robots, points[:2]
         m = arclength.shape[1]
         if not m:

@@ -25,9 +25,10 @@ from fastrod.kernels.contact_batch import search_gaps, search_worlds
 from fastrod.kernels.press_batch import end_some, press_some, renew_some, violations
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
 from fastrod.model.robot import Robot
+from fastrod.rotation import displaced
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_arrays
-from fastrod.solver.modal import Step, in_threads
+from fastrod.solver.modal import Step, in_threads, no_hosts
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
 from fastrod.solver.options import Modal, Modes
@@ -95,9 +96,10 @@ class TouchingRods(ModalRods):
 
     def accept(self, given: Inputs, how: How | None) -> None:
         """Take how the next step is to be. Raises `InputError` for what rods that touch do not take."""
-        if how is not None and (how.inverse_inertia is not None or how.estimate_error):
-            what = "inverse_inertia" if how.inverse_inertia is not None else "estimate_error"
-            raise InputError(f"{what} was given with a contact scene, which does not take it; leave it out.")
+        if how is not None and how.estimate_error:
+            raise InputError(
+                "estimate_error was given with a contact scene, which does not take it; leave it out."
+            )
         super().accept(given, how)
 
     def step(self, rows: Ints, acting: Acting, last: Last, how: How) -> Solved:
@@ -106,6 +108,7 @@ class TouchingRods(ModalRods):
         found, cold = self.begin(acting), engine.whole_worlds(self._mask(rows) & ~last.warm)
         ok = self._rest(rows[cold[rows] | (not self.dynamics)], cold, acting, last, found, AT_REST)
         warm = rows[~cold[rows]] if self.dynamics and before is not None else rows[:0]
+        self.modal.host = no_hosts() if self._host is None else self._host
         if len(warm) and before is not None:
             start, inputs = copied(self.modal.motion), (before, acting.ports)
             jump, pressed = stepper.jumps(*inputs), engine.pressed()
@@ -116,6 +119,7 @@ class TouchingRods(ModalRods):
             some = warm[meets[warm]]
             _put(self.modal.motion, start, some)
             ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
+        self.modal.host = no_hosts()
         engine.accept(rows[ok[rows]], found.shape)
         return self.end(rows, ok, found, acting, last)
 
@@ -123,6 +127,7 @@ class TouchingRods(ModalRods):
         """Bring these robots to rest, to `tolerance` [m] in a step of a second."""
         found, cold = self.begin(acting), self.engine.whole_worlds(self._mask(rows) & ~last.warm)
         ok = self._rest(rows, cold, acting, last, found, tolerance)
+        self._errors = self._host = None
         self.engine.accept(rows[ok[rows]], found.shape)
         return self.end(rows, ok, found, acting, last)
 
@@ -135,7 +140,7 @@ class TouchingRods(ModalRods):
     def end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
         """The state, with what has stopped those that are not ok; they go on from where they were."""
         self.engine.end_step(ok.astype(float))
-        solved = self._solved(found, ok, acting.ports)
+        solved = self._solved(found, ok, self._moved_bases(acting.ports, found))
         passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
         for i in map(int, rows[~ok[rows]]):
             k, s = self._nearest.get(i, (-1, 0.0))
@@ -258,14 +263,27 @@ class TouchingRods(ModalRods):
         left = lost = rows[~ok[rows]]
         if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
-        before = engine.before
+        before, host, place = engine.before, self.modal.host, motion.place[:, :3].copy()
+        aside, step, mean = (np.zeros_like(host.moved) for _ in range(3))
         for k in range(4):
             fraction = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
-            left = left[self._advance_pressed(left, acting, inputs, fraction, found)[left]]
+            if hosts := len(aside):  # a body goes on at the speed that the rod has given it
+                aside += step
+                arm = motion.place[:, :3] - place
+                one, other = (displaced(p.base_pose, aside) for p in inputs)
+                some = inputs[0]._replace(base_pose=one), inputs[1]._replace(base_pose=other)
+            left = left[self._advance_pressed(left, acting, some if hosts else inputs, fraction, found)[left]]
+            if hosts:
+                step += host.moved
+                aside += host.moved
+                mean += 0.25 * host.wrench
+                mean[:, 3:] += 0.25 * np.cross(arm, host.wrench[:, :3])
             self._measure_anew(left)
             if k < 3:
                 engine.accept(left, found.shape, between_steps=True)
         ok[left] = True
+        if len(aside):
+            host.moved[left], host.wrench[left] = aside[left], mean[left]
         back = lost[~ok[lost]]
         _put(motion, start, back)
         self._go_back(back, contacts)
@@ -301,7 +319,11 @@ class TouchingRods(ModalRods):
         """(n_robots,) who moved on in one step: those in whose world Newton's method has ended. With `follow`
         contacts go first where the gap is least."""
         engine, modal, n, motion = self.engine, self.modal, self.n_robots, self.modal.motion
-        contacts, q, left = engine.contact_set, motion.q + how.dt * motion.rate, rows
+        contacts, left, n_q = engine.contact_set, rows, motion.q.shape[1]
+        base = np.zeros((n, 6 if len(modal.host.inertia) else 0))  # displacement of those that give way
+        start, q = (np.concatenate([a, base], axis=1) for a in (motion.q, motion.q + how.dt * motion.rate))
+        length = float(np.max(modal.params.rod_length))
+        unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
         size, deep, ok = np.full(n, np.inf), self._deep, np.zeros(n, bool)
@@ -313,7 +335,7 @@ class TouchingRods(ModalRods):
             world, near, n_found = self._seen(left, ports, how, q, found, span)
             through = self._mask(left[n_found < 0])
             if count == 0 and through.any():  # at that speed it would go through: from where it is
-                q[through] = motion.q[through]
+                q[through] = start[through]
                 world, near, n_found = self._seen(left, ports, how, q, found, span)
                 through = self._mask(left[n_found < 0])
             search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin, _SAME_GAP)
@@ -342,10 +364,10 @@ class TouchingRods(ModalRods):
             model = (d.hessian, d.gradient, d.point_change, d.point_turn, acting.points[0].shape[1], yielding)
             self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
             q[left] += step[left]
-            size[left] = np.abs(step[left]).max(1) * float(np.max(modal.params.rod_length))
+            size[left] = np.abs(unit * step[left]).max(1)
             self._passes[left] += 1
             lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
-            q[lost] = motion.q[lost]
+            q[lost] = start[lost]
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):
             modal.place_points(self._points(arrived, acting), ports.extension)

@@ -61,6 +61,7 @@ class Rods:
         history = fields(work.history)
         history[:] = rng.normal(size=history.shape)
         history[:, :, :3] *= 0.05
+        history[:, :, ml.H_MOMENT : ml.H_MOMENT + 3] = 0.0  # a moment has no energy
         history[:, :, ml.H_J : ml.H_J + 3] = np.array(SPIN)[:, None]
         fields(work.offset)[:] = rng.normal(size=(n_pieces, 2 * n_tendons, W)) * 0.006
         turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -15,6 +15,8 @@ from .chunk import ModalRun, gather_all
 from .fields import (
     C_TH,
     C_V,
+    G_ON,
+    G_P,
     H_D,
     H_FOLLOW,
     H_J,
@@ -34,7 +36,7 @@ from .fields import (
 )
 from .follower import follow, tip_motion
 from .gather import ModalBatch
-from .host import no_host
+from .host import demand_of_base, hosted, no_host, put_base, rigid_stiffness, start_host
 from .modes import ModalBasis
 from .motion import (
     BDF1,
@@ -112,7 +114,7 @@ def count_from_here(work: ModalWork) -> None:
 @kernel
 def write_matrix(robots: Ints, n_robots: int, work: ModalWork, sign: float, out: Floats) -> None:
     """Add the Hessian, or take it away, both halves."""
-    n = out.shape[1]
+    n = len(work.q) // W
     for w in range(n_robots):
         i = robots[w]
         for a in range(n):
@@ -256,6 +258,37 @@ def write_points(
 
 
 @kernel
+def write_base(
+    robots: Ints, n_robots: int, batch: ModalBatch, work: ModalWork, out: ModalDerivatives
+) -> None:
+    """Six unknowns more of a base that gives way, its displacement and rotation: gradient, Hessian, and the
+    motion of the point forces."""
+    n_q, n_points = len(work.q) // W, out.point_change.shape[1]
+    demand_of_base(batch.basis, batch.motion, work, work.scratch)
+    for w in range(n_robots):
+        i, base, on = robots[w], get(work.base, 9, w), read(work.host, G_ON, w) > 0.0
+        for r in range(6):
+            a = n_q + r
+            if not on:
+                out.hessian[i, a, a] = 1.0
+                continue
+            out.gradient[i, a] = read(work.scratch, r, w)
+            for c in range(r + 1):
+                stiffness = rigid_stiffness(work, r, c, w) + read(work.host, G_P + 6 * r + c, w)
+                out.hessian[i, a, n_q + c] = out.hessian[i, n_q + c, a] = stiffness
+            for c in range(n_q):
+                coupled = read(work.host_change, r * n_q + c, w)
+                out.hessian[i, a, c] = out.hessian[i, c, a] = coupled
+            axis = (1.0 if r % 3 == 0 else 0.0, 1.0 if r % 3 == 1 else 0.0, 1.0 if r % 3 == 2 else 0.0)
+            for q in range(n_points):
+                place = (out.point[i, q, 0], out.point[i, q, 1], out.point[i, q, 2])
+                moved = cross(axis, sub(place, base)) if r >= 3 else axis
+                for f in range(3):
+                    out.point_change[i, q, f, a] = moved[f]
+                    out.point_turn[i, q, f, a] = axis[f] if r >= 3 else 0.0
+
+
+@kernel
 def derivatives_of_modes(
     robots: Ints,
     n_robots: int,
@@ -265,8 +298,8 @@ def derivatives_of_modes(
     every: ModalWork,
     out: ModalDerivatives,
 ) -> None:
-    """Derivatives of a chunk at `unknowns` (n_robots, n_q): at rest, or in a step of `run` from the motion
-    in `batch`."""
+    """Derivatives of a chunk at `unknowns` (n_robots, n_q, six more where bases give way): at rest, or in a
+    step of `run` from the motion in `batch`."""
     work, command, jump = one_task(every, 0), run.command[0], run.lanes[0, 0]
     gather_all(robots, batch, command, work)
     for w in range(W):
@@ -279,10 +312,17 @@ def derivatives_of_modes(
             base_soon(robots, batch.motion, scheme, run.dt, work.base)
         if work.piece[0, P_UNEVEN * W] > 0.0:
             curvature_counted_from(batch.basis, work)
-    no_host(work)
+    if run.kind == REST or run.kind == AFTER_JUMP:
+        no_host(work)
+    else:
+        start_host(
+            robots, batch.host, batch.motion, Scheme(run.kind, run.dt, run.rho), jump, batch.basis, work
+        )
     for w in range(W):
-        for a in range(unknowns.shape[1]):
+        for a in range(len(work.q) // W):
             write(work.q, a, w, unknowns[robots[w], a])
+    if hosted(work):
+        put_base(robots, unknowns, work)
     sweep(batch.basis, batch.pieces.first_tendon, command, work, True)
     follow(work)
     assemble(batch.basis, batch.pieces.first_tendon, work)
@@ -294,6 +334,8 @@ def derivatives_of_modes(
         write_points(robots, n_robots, batch, work, out)
     if len(out.hessian) > 0:
         write_matrix(robots, n_robots, work, 1.0, out.hessian)
+        if hosted(work):
+            write_base(robots, n_robots, batch, work, out)
     if len(out.damping) > 0:
         write_matrix(robots, n_robots, work, 1.0, out.damping)
         for w in range(W):

@@ -197,6 +197,15 @@ def place_base(work: ModalWork) -> None:
         put(work.base, 9, w, add(get(work.host, G_FREE + 9, w), get(work.host, G_D, w)))
 
 
+@inline
+def put_base(robots: Ints, given: Floats, work: ModalWork) -> None:
+    """The displacement of the bases, behind the unknowns of the rods (n_robots, n_q + 6)."""
+    n_q = len(work.q) // W
+    for k in range(6):
+        for w in range(W):
+            write(work.host, G_D + k, w, given[robots[w], n_q + k])
+
+
 @kernel
 def couple_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
     """Work of a displacement and a rotation of the base on the modes of a piece, from `work.coupling` about
@@ -254,13 +263,9 @@ def rigid_stiffness(work: ModalWork, r: int, c: int, w: int) -> float:
 
 
 @kernel
-def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> None:
-    """The Newton step of the bases into G_STEP, and its part in `work.gradient`, which is L^-1 g: between the
-    two halves of its solution. `work.host_change` becomes L^-1 H_qb."""
-    n_q, to = len(work.q) // W, work.host
-    matrix, right = LaneMatrix(work.host_matrix, 6), work.scratch
-    for k in range(6):
-        forward(hessian(work), work.host_change[k * n_q * W : (k + 1) * n_q * W])
+def demand_of_base(b: ModalBasis, motion: ModalMotion, work: ModalWork, right: Lanes) -> None:
+    """Derivative of the energy by displacement and rotation of the bases, into `right` (6,), and G_PULL."""
+    to = work.host
     for w in range(W):
         inertia, turning = inertia_about_base(w, b, motion, work)
         kappa = read(to, G_KAPPA, w)
@@ -275,6 +280,18 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
             for w in range(W):
                 spring = read(to, G_P + 6 * r + c, w)
                 write(right, r, w, read(right, r, w) + spring * read(to, G_D + c, w))
+
+
+@kernel
+def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> None:
+    """The Newton step of the bases into G_STEP, and its part in `work.gradient`, which is L^-1 g: between the
+    two halves of its solution. `work.host_change` becomes L^-1 H_qb."""
+    n_q, to = len(work.q) // W, work.host
+    matrix, right = LaneMatrix(work.host_matrix, 6), work.scratch
+    for k in range(6):
+        forward(hessian(work), work.host_change[k * n_q * W : (k + 1) * n_q * W])
+    demand_of_base(b, motion, work, right)
+    for r in range(6):
         for c in range(r + 1):
             for w in range(W):
                 write_at(matrix, r, c, w, rigid_stiffness(work, r, c, w))

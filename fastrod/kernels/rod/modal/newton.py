@@ -39,7 +39,7 @@ from .fields import (
     hessian,
 )
 from .follower import correct_step, follow
-from .host import ModalHost, base_step, hosted, move_base, place_base
+from .host import ModalHost, base_step, hosted, move_base, place_base, put_base
 from .modes import ModalBasis
 from .motion import ModalMotion
 from .sweep import sweep_piece
@@ -269,14 +269,16 @@ def hold(
     work: ModalWork,
     with_forces: bool,
 ) -> None:
-    """The shape at the unknowns `given` (n_robots, n_q), and `with_forces` what its modes work against
-    there."""
+    """The shape at the unknowns `given` (n_robots, n_q, six more of bases that give way), and `with_forces`
+    what its modes work against there."""
     for w in range(W):
-        for a in range(given.shape[1]):
+        for a in range(len(work.q) // W):
             write(work.q, a, w, given[robots[w], a])
         write(work.newton, L_DONE, w, 1.0)
         write(work.newton, L_COUNT, w, 1.0)
         write(work.newton, L_CORRECTION, w, 0.0)
+    if hosted(work):
+        put_base(robots, given, work)
     sweep(b, first_tendon, command, work, with_forces)
     if with_forces:
         follow(work)
