@@ -31,8 +31,8 @@ class CarriedRod(ABC):
     of the world at each step.
 
     Rod and body move together within the step, at any ratio of their masses. A rod whose every segment has a
-    line_density moves with inertia; one that feels contact has, for the body, that of its shape as a rigid
-    body; one without density has neither mass nor weight, and a line on stderr says so.
+    line_density moves with inertia, in contact too; one without density has neither mass nor weight, and a
+    line on stderr says so.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
     each.
@@ -191,7 +191,7 @@ def rod_of(
     scene, densities = None, [segment.line_density for segment in robot.segments]
     if dynamics is None:
         by_energy = all(segment.mode != "paper" for segment in robot.segments)
-        dynamics = not body_contacts and by_energy and min(densities) > 0.0
+        dynamics = by_energy and min(densities) > 0.0
     if not any(densities):
         note_massless(robot.name)
     if body_contacts:
@@ -199,6 +199,9 @@ def rod_of(
             obstacles=[shape.obstacle for body in body_contacts for shape in body.shapes],
             max_contacts=max_contacts,
         )
+    if dynamics:  # what it touches feels its inertia
+        for contact in body_contacts:
+            contact.relaxation = 0.0
     return Rod(
         robot,
         dt=dt,

@@ -74,6 +74,8 @@ class TouchingRods(ModalRods):
         self._passes = np.zeros(self.n_robots, np.int64)
         self._blocked = np.zeros(self.n_robots, bool)  # by what they touch, before they begin
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
+        # of free bodies: in a step, and in a rest until then (`Touching.gone`)
+        self._ways, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
     def replace(self, robots: Sequence[Robot]) -> None:
@@ -204,7 +206,7 @@ class TouchingRods(ModalRods):
                 was, how = modal.motion.place.copy(), Step(BDF1, float(each))
                 well = self._one(some, acting, inputs, how, (done.copy(), aim), found, follows)
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
-                done[well] = aim[well]
+                done[well], self._gone[well] = aim[well], self._ways[well]
                 arrived = well & (done >= 1.0)
                 there += arrived
                 engine.place_at_once(arrived)
@@ -217,7 +219,7 @@ class TouchingRods(ModalRods):
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
                 break
-        engine.slides[rows] = True
+        engine.slides[rows], self._gone[rows] = True, 0.0
         self._hold_up(rows)
         return ok
 
@@ -361,8 +363,16 @@ class TouchingRods(ModalRods):
             modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
             yielding = (how.dt / self.stepper.time.dt) ** 2 if self.dynamics else 1.0
-            model = (d.hessian, d.gradient, d.point_change, d.point_turn, acting.points[0].shape[1], yielding)
-            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
+            model = (
+                d.hessian,
+                d.gradient,
+                d.point_change,
+                d.point_turn,
+                acting.points[0].shape[1],
+                self._gone,
+                yielding,
+            )
+            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._ways))
             q[left] += step[left]
             size[left] = np.abs(unit * step[left]).max(1)
             self._passes[left] += 1

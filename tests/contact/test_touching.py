@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fastrod import Modal, Modes, Robot, Segment, Simulator, Tendon
 from fastrod.contact import ContactScene, Obstacle, box, cylinder, mesh, plane, sphere
 from fastrod.errors import InputError
+from fastrod.rotation import displaced, quaternion_from_matrix
 
 RADIUS, LENGTH, EI, DENSITY = 0.004, 0.1, 0.01, 0.05
 ALONG_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
@@ -190,24 +191,22 @@ def test_distances_by_fcl_give_the_same_motion(dt: float) -> None:
         assert_allclose(one, other, atol=1e-9)
 
 
-def crossing(solver: str, dynamics: bool) -> Simulator:
+def crossing(dynamics: bool) -> Simulator:
     """Two rods that cross, the second a little aside."""
-    density = DENSITY if dynamics else 0.0
-    first = rod(line_density=density)
+    first = rod(line_density=DENSITY if dynamics else 0.0)
     across = replace(
         first, base_position=(0.0085, -0.05, 0.07), base_quaternion=(0.5**0.5, -(0.5**0.5), 0, 0)
     )
     scene = ContactScene(worlds=[0, 0], rod_radius=RADIUS)
-    given: Any = Modal(dynamics=True, modes=Modes(6, 4, pieces=2)) if dynamics else solver
+    given: Any = Modal(dynamics=True, modes=Modes(6, 4, pieces=2)) if dynamics else None
     return Simulator([first, across], dt=1e-3, solver=given, contact=scene)
 
 
 @pytest.mark.study
-@pytest.mark.parametrize("dynamics", [True, False])
-def test_two_rods_press_on_each_other_as_those_of_the_observer_do(dynamics: bool) -> None:
+def test_two_rods_press_on_each_other_in_motion_as_at_rest() -> None:
     force = np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
     found = []
-    for sim in (crossing("observer", False), crossing("modal", dynamics)):
+    for sim in (crossing(False), crossing(True)):
         for part in np.linspace(0.0, 1.0, 12):
             state = sim.settle(tip_force=part * force)
             assert state.ok.all(), state.problems
@@ -243,20 +242,80 @@ def test_a_rod_that_is_let_go_throws_a_free_ball_to_first_order_in_the_step() ->
     assert 1.5 < gained[0] / gained[1] < 2.6
 
 
-@pytest.mark.study
-def test_at_rest_modes_and_observer_bear_alike() -> None:
-    found = []
-    for solver in ("observer", "modal"):
-        robot = rod(line_density=0.0)
-        scene = ContactScene(obstacles=[replace(BALL, friction=0.0)], rod_radius=RADIUS)
-        sim = Simulator(robot, solver=solver, contact=scene)  # type: ignore[arg-type]
-        for part in np.linspace(0.0, 1.0, 9):
-            state = sim.step(tip_force=(0.4 * part, 0.05 * part, 0.0))
-            assert state.ok.all(), state.problems
-        found.append((state.tip_position, state.contacts.total_force))
-    (tip, force), (tip_other, force_other) = found
-    assert_allclose(tip, tip_other, atol=1e-5)
-    assert_allclose(force, force_other, atol=2e-3 * np.abs(force).max())
+def test_a_rod_that_touches_is_bent_as_a_free_one_by_the_same_forces() -> None:
+    """Free ones are the observer's, those that touch are rods of modes."""
+    robot = rod(line_density=0.0)
+    scene = ContactScene(obstacles=[replace(BALL, friction=0.0)], rod_radius=RADIUS)
+    touching, free = Simulator(robot, contact=scene), Simulator(robot)
+    for part in np.linspace(0.0, 1.0, 9):
+        state = touching.step(tip_force=(0.4 * part, 0.05 * part, 0.0))
+        assert state.ok.all(), state.problems
+        contacts = state.contacts
+        loads = list(zip(contacts.arclength[0], contacts.force[0], strict=True))
+        alone = free.settle(tip_force=(0.4 * part, 0.05 * part, 0.0), point_force=loads or None)
+        assert_allclose(state.tip_position, alone.tip_position, atol=1e-5)
+    assert contacts.in_contact().all()
+    touching.step(tip_force=(0.0, 0.0, 0.0))
+    state = touching.step(tip_force=(0.0, 0.0, 0.0))
+    assert not state.contacts.in_contact().any()
+    assert_allclose(state.tip_position, free.settle().tip_position, atol=1e-9)
+
+
+def coiled(turn: float) -> dict[str, Any]:
+    """Tendons that bend the third segment most, so that its tip comes to the first from the side [rad]."""
+    share = np.cumsum([0.0, 1.0, 3.0]) / 4.0
+    return {"tendon_length": REST + np.tile([-1.0, 0.0, 1.0, 0.0], 3) * np.repeat(share, 4) * 0.004 * turn}
+
+
+REST = np.repeat([0.1, 0.2, 0.3], 4)
+
+
+@pytest.mark.parametrize("dynamics", [False, pytest.param(True, marks=pytest.mark.study)])
+def test_a_rod_that_coils_feels_itself(dynamics: bool) -> None:
+    tendons = tuple(
+        Tendon(offset=0.004, angle=a, compliance=1e-5) for a in (0.0, np.pi / 2, np.pi, 1.5 * np.pi)
+    )
+    (segment,) = rod(
+        mode="tendon_length", tendons=tendons, line_density=DENSITY if dynamics else 0.0
+    ).segments
+    robot = Robot(name="coil", segments=(segment, segment, segment), gravity=WEIGHTLESS)
+    scene = ContactScene(self_contact=True, rod_radius=0.005)
+    sim = Simulator(robot, dt=2e-3, points_per_segment=20, contact=scene, dynamics=dynamics)
+    sim.settle(**coiled(np.radians(400.0)))
+    for turn in np.radians(np.arange(400.0, 444.0, 1.8)):
+        state = sim.step(**coiled(turn))
+        assert state.ok.all(), state.problems
+    assert state.contacts.count[0] >= 2
+    assert_allclose(state.contacts.total_force[0], 0.0, atol=1e-9)
+    s = np.linspace(0.0075, 0.3, 400)
+    place = sim.shape(s).position[0]
+    apart = np.linalg.norm(place[:, None] - place, axis=2)[np.abs(s[:, None] - s) > 0.05].min()
+    assert apart > 0.01 - 2e-5
+
+
+@pytest.mark.parametrize("ratio", [0.2, 20.0])
+def test_a_body_and_its_rod_lose_no_momentum_when_the_rod_hits_a_wall(ratio: float) -> None:
+    """The engine's part is done here: the body flies, and feels the mean wrench of the rod."""
+    dt, robot = 1e-3, rod()
+    wall = plane(point=(0.0, 0.0, LENGTH + 0.004), normal=(0.3, 0.0, -1.0), name="wall", friction=0.4)
+    sim = simulator(robot, wall)
+    sim.settle()
+    mass = ratio * DENSITY * LENGTH
+    inverse = np.diag(1.0 / np.repeat([mass, mass * 0.02**2], 3))
+    twist, pose = np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    sim.set_in_motion(twist)
+    before, touched = sim.momentum()[0], 0
+    for _ in range(40):
+        state = sim.step(base_pose=displaced(pose[None], dt * twist[None])[0], inverse_inertia=inverse)
+        assert state.ok.all(), state.problems
+        now, force = sim.momentum()[0], state.contacts.total_force[0]
+        assert_allclose((now - before)[:3] + dt * state.mean_wrench[0, :3], dt * force, atol=1e-15)
+        twist, before = twist + dt * inverse @ state.mean_wrench[0], now
+        pose = np.concatenate([state.position[0, 0], quaternion_from_matrix(state.rotation[:1, 0])[0]])
+        touched += force.any()
+    assert touched > 0
+    assert state.contacts.clearance[0] > -1e-5
+    assert 0.5 * mass * twist[:3] @ twist[:3] < 0.5 * mass * 0.5**2
 
 
 def test_what_goes_with_no_contact_is_refused() -> None:

@@ -27,7 +27,7 @@ from .bvh import Numbers, Record, normal_of
 from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, rotation_at, tangent_at
 from .contact_set import carries, set_normal, wall_at
 from .rod_proximity import partner_of
-from .surface import surface_curvature
+from .surface import rotation_of, surface_curvature, to_obstacle
 from .tunnelling import carried
 
 SOFT = 1e-8
@@ -94,6 +94,9 @@ class Touching(NamedTuple):
     """(n_robots, n_points, 3, n_q) and rotation of the cross-sections there."""
     first: int
     """Number of the first contact among these points."""
+    gone: Floats
+    """(n_robots, n_obstacles, 6) displacement of free bodies, and moment on them, at which a rest was before:
+    what slips against them is counted from there."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
 
@@ -149,13 +152,14 @@ def _measure_obstacle(
     p = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
     margin = motion.margin * all_of_it.rods.length[i]
-    old, last = normal_of(contact), (contact.place[0], contact.place[1], contact.place[2])
+    old, last, local = normal_of(contact), contact.place, to_obstacle(frame, p)
+    moved = mul(rotation_of(frame), (local[0] - last[0], local[1] - last[1], local[2] - last[2]))
     d, n = wall_at(k, frame, p, old, margin, surfaces, stack, wall)
     first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
-    contact.place[0], contact.place[1], contact.place[2] = p
-    if carries(contact) and _jumps(n, old, sub(p, last), d):
+    contact.place[0], contact.place[1], contact.place[2] = local
+    if carries(contact) and _jumps(n, old, moved, d):
         # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
-        n, contact.gap, d = old, contact.gap + dot(old, sub(p, last)), 0.0
+        n, contact.gap, d = old, contact.gap + dot(old, moved), 0.0
     else:
         contact.gap = d - contact.radius
     set_normal(contact, n)
@@ -372,7 +376,7 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedW
 
 
 @kernel
-def _body_of(k: int, surfaces: Surfaces) -> int:
+def body_of(k: int, surfaces: Surfaces) -> int:
     """Number of the first obstacle of the body that obstacle k is scaled of: the numbers of bodies are the
     user's."""
     first = k
@@ -451,9 +455,12 @@ def gather_world(
             if other >= 0:
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
             elif surfaces.mobility[k, 0] > 0.0:
-                at = n + 6 * _body_of(k, surfaces)
+                at = n + 6 * body_of(k, surfaces)
                 place = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
+                for r in range(1, 3):
+                    for a in range(6):
+                        pressing.free[m, r] -= pressing.along[m, r, at + a] * all_of_it.gone[i, k, a]
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
@@ -468,7 +475,7 @@ def gather_world(
                     pressing.gradient[a] += pressed * pressing.along[m, r, a]
             m += 1
     for k in range(n_obstacles if most > n else 0):
-        mobility, at = surfaces.mobility[k], n + 6 * _body_of(k, surfaces)
+        mobility, at = surfaces.mobility[k], n + 6 * body_of(k, surfaces)
         if mobility[0] > 0.0:
             for a in range(3):
                 pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)

@@ -98,6 +98,7 @@ class NeckPush(HostedScene):
         tips: list[NDArray[np.float64]] = []
         speeds: list[tuple[float, float, bool]] = []
         balance, momentum, pushed, gave, depth = np.zeros(3), 0.0, 0.0, 0.0, 0.0
+        carried, weighed = np.zeros(3), weight
         for t in self.play(stage):
             state = rod.state
             assert state is not None
@@ -105,8 +106,12 @@ class NeckPush(HostedScene):
             self.expect(bool(state.ok[0]), f"at {t:.3g} s the neck is not ok: {state.problems.get(0)}")
             force = rod.body_contacts[0].exerted[:3]
             extended = weight * state.arclength[0, -1] / stage.robot.length
-            fraction = self.dt / self.duration  # in the mean: the neck's inertia evens out
+            fraction = self.dt / self.duration
             balance = balance + fraction * (rod.wrench[:3] + force - [0.0, 0.0, -extended])
+            # what is paid out is as fast as what there was
+            carries = rod.simulator.momentum()[0, :3]
+            balance = balance + (carries - carried * extended / weighed) / self.duration
+            carried, weighed = carries, extended
             velocity = np.array(world.getBaseVelocity(cube)[0])
             given = self.dt * (force + _floor_force(world, cube) - [0.0, 0.0, 9.81 * MASS])
             momentum = max(momentum, float(np.abs(MASS * (velocity - before) - given).max()))
