@@ -62,11 +62,6 @@ class Problem(Enum):
     """No forces were found that push the rod out of an obstacle, or no start outside of it."""
     CONTACT_TUNNELLED = "contact_tunnelled"
     """The rod would go through an obstacle."""
-    CONTACT_DIVERGED = "contact_diverged"
-    """The rod's shape diverged while an obstacle held it, or neither these inputs nor its rest shape could be
-    solved."""
-    NO_NODE_LEFT = "no_node_left"
-    """A segment has more contacts than nodes."""
     NO_CONTACT_LEFT = "no_contact_left"
     """The rod has as many contacts as it may have."""
 

@@ -72,7 +72,9 @@ class TouchingRods(ModalRods):
         if time.scheme == GENERALIZED_ALPHA:
             self.stepper.time = time._replace(scheme=BDF2)
         self._passes = np.zeros(self.n_robots, np.int64)
-        self._blocked = np.zeros(self.n_robots, bool)  # by what they touch, before they begin
+        # by what they touch, before they begin; in the last try, who was to go through something, and whose
+        # contacts were as many as there may be
+        self._blocked, self._through, self._full = np.zeros((3, self.n_robots), bool)
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
         # of free bodies: in a step, and in a rest until then (`Touching.gone`)
         self._ways, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
@@ -152,6 +154,13 @@ class TouchingRods(ModalRods):
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
             said, kind = f"{said}; come there in smaller steps.", Problem.CONTACT_STUCK
+            if self._through[i]:
+                said = f"contact{where}: the rod would go through it; take smaller steps, or go around it."
+                kind = Problem.CONTACT_TUNNELLED
+            if self._full[i]:
+                most = f"raise ContactScene.max_contacts above {self.engine.scene.max_contacts}"
+                said = f"contact{where}: the rod has no contact left; {most}."
+                kind = Problem.NO_CONTACT_LEFT
             if self._blocked[i]:
                 said = "contact: neither the rod's rest nor its straight shape is clear; begin where it is."
                 kind = Problem.CONTACT_INSIDE
@@ -328,7 +337,7 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
-        size, deep, ok = np.full(n, np.inf), self._deep, np.zeros(n, bool)
+        size, deep, ok, gone = np.full(n, np.inf), self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
         for count in range(most + 1):
@@ -345,7 +354,7 @@ class TouchingRods(ModalRods):
             if self._is_rigid:  # the whole rod, and not what its candidates show
                 np.maximum(deep, -engine.clearance.gap, out=deep)
             if count and not self.dynamics:  # it is led there by a shorter way
-                gone = engine.whole_worlds(through)
+                gone |= engine.whole_worlds(through)
                 self._note_nearest(left[gone[left]], near[gone[left]], n_found[gone[left]])
                 left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]
             busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
@@ -383,7 +392,12 @@ class TouchingRods(ModalRods):
             modal.place_points(self._points(arrived, acting), ports.extension)
             modal.hold(arrived, ports, *found, how, q, True)
             end_some(arrived, contacts)
-        self._go_back(rows[~ok[rows]], then)
+        failed = rows[~ok[rows]]
+        self._through[failed], self._full[failed] = (
+            gone[failed],
+            contacts.used[failed] == contacts.contact.shape[1],
+        )
+        self._go_back(failed, then)
         modal.place_points(acting.points, ports.extension)
         return ok
 
