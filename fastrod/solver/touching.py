@@ -49,7 +49,8 @@ _DIVISIONS = 4  # of a step into four
 _ROOM = 4  # contacts: room is made for a multiple
 AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
 _MOST_STEPS, _GROWS, _FALLS = 100, 16.0, 1.0 / 16.0  # to a rest, and by how much they grow, or fall
-_FIRST, _RESTS, _LONGEST, _GIVEN_UP = 1e-3, 1.0, 1e4, 1e-9  # s: their lengths
+_FIRST, _RESTS, _LONGEST, _GIVEN_UP = 1e-3, 10.0, 1e4, 1e-9  # s: their lengths
+_LATE, _SAME_PLACE = 1e-5, 1e-7  # rad, m: by so little a rod may change after its contacts were placed
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
@@ -78,6 +79,7 @@ class TouchingRods(ModalRods):
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
         # of free bodies: in a step, and in a rest until then (`Touching.gone`)
         self._ways, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
+        self._late = np.zeros(self.n_robots)  # largest step since contacts stayed where they were [rad]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
     def replace(self, robots: Sequence[Robot]) -> None:
@@ -169,7 +171,9 @@ class TouchingRods(ModalRods):
         return solved._replace(passes=passes, problems=problems, kind=Problem.CONTACT_STUCK, held=held)
 
     def _mask(self, rows: Ints) -> Flags:
-        return np.isin(np.arange(self.n_robots), rows)
+        some = np.zeros(self.n_robots, bool)
+        some[rows] = True
+        return some
 
     def _rest(
         self, rows: Ints, cold: Flags, acting: Acting, last: Last, found: PassShapes, tolerance: float
@@ -221,6 +225,9 @@ class TouchingRods(ModalRods):
                 engine.place_at_once(arrived)
                 self._measure_anew(np.flatnonzero(well & ~arrived))
                 moved = np.abs(modal.motion.place - was).max(1) >= max(tolerance, _CREEPS)
+                if tolerance >= AT_REST and not self.dynamics:
+                    # a millionth of that is left, and no contact would go elsewhere
+                    moved &= (self._late > _LATE) | (self._deep > _SAME_PLACE)
                 ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
                 size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), _FALLS * each)
                 part[some] *= np.where(well[some], 4.0, 0.25)
@@ -384,6 +391,7 @@ class TouchingRods(ModalRods):
             self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._ways))
             q[left] += step[left]
             size[left] = np.abs(unit * step[left]).max(1)
+            self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
             self._passes[left] += 1
             lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
             q[lost] = start[lost]

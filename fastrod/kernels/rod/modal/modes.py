@@ -50,23 +50,18 @@ def legendre_at(x: Floats | float, n_degrees: int) -> Floats:
 
 @cache
 def _points(n: int) -> tuple[Floats, Floats, Floats]:
-    """Gauss-Lobatto points of [0, 1], Legendre coefficients of their Lagrange polynomials, and S."""
+    """Gauss-Lobatto points of [0, 1], and Legendre coefficients of their Lagrange polynomials and of the
+    integrals from 0 of these."""
     inner = legendre.Legendre.basis(n).deriv().roots()
     x = np.concatenate([[0.0], 0.5 * (1.0 + np.sort(inner.real)), [1.0]])
     values = legendre.legvander(2.0 * x - 1.0, n)
     coefficients = np.asarray(np.linalg.inv(values), dtype=np.float64)  # column j: polynomial of node j
-    return x, coefficients, _integrals_to(x, coefficients)
-
-
-def _integrals_to(x: Floats | float, coefficients: Floats) -> Floats:
-    """(..., N + 1) integrals from 0 to x of the polynomials with these Legendre coefficients."""
-    primitive = 0.5 * legendre.legint(coefficients, lbnd=-1, axis=0)
-    return np.asarray(legendre_at(x, len(primitive)) @ primitive)
+    return x, coefficients, np.asarray(0.5 * legendre.legint(coefficients, lbnd=-1, axis=0))
 
 
 def integral_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
     """(..., N + 1) row of S for a place that is no node: position there is r_0 + l sum of row_j t_j."""
-    return _integrals_to(x, _points(n)[1])
+    return np.asarray(legendre_at(x, n + 2) @ _points(n)[2])
 
 
 def lagrange_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
@@ -79,7 +74,8 @@ def modal_basis(
     bending: int, torsion: int, shear: int = 0, stretch: int = 0, n: int = N_INTERVALS
 ) -> ModalBasis:
     """Tables for so many modes of each kind."""
-    x, _, integral = _points(n)
+    x = _points(n)[0]
+    integral = integral_row(x, n)
     width, weight = np.diff(x), integral[-1]
     gauss = x[:-1, None] + width[:, None] * np.array(GAUSS)
     counts = (bending, bending, torsion, shear, shear, stretch)
