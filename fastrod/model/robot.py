@@ -170,6 +170,9 @@ class Segment:
     """u*, curvature without moment, material frame [1/m]."""
     body_radius: float = 0.0
     """Radius of the body, for contact and drawing [m]; 0 stands for just beyond the outermost tendon."""
+    gyration_radius: float = 0.0
+    """Radius of gyration of the cross-section about its diameters, for the inertia of its turns in motion
+    [m]; 0 stands for half of `body_radius`, that of a solid round one."""
     line_density: float = 0.0
     """Mass per length [kg/m]; 0 is weightless."""
     damping_time: float = 0.0
@@ -284,11 +287,12 @@ class Segment:
             raise RobotError(f"A passive segment has no tendons; it was given {len(self.tendons)}.")
         if self.mode != "passive" and not self.tendons:
             raise RobotError(f"A segment in mode {self.mode!r} needs tendons; give some, or mode 'passive'.")
-        if not (math.isfinite(self.body_radius) and 0.0 <= self.body_radius <= _LONGEST):
-            raise RobotError(
-                f"Segment.body_radius is {self.body_radius!r} m; it must be between 0 and "
-                f"{_LONGEST:g} m. Was it given in mm?"
-            )
+        for name in ("body_radius", "gyration_radius"):
+            if not _number(getattr(self, name)) or not 0.0 <= getattr(self, name) <= _LONGEST:
+                raise RobotError(
+                    f"Segment.{name} is {getattr(self, name)!r} m; it must be between 0 and "
+                    f"{_LONGEST:g} m. Was it given in mm?"
+                )
 
 
 @named_fields(RobotError)

@@ -32,7 +32,7 @@ from fastrod.kernels.rod.modal.modes import (
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import ModalOutput, ModalSamples, MotionShape
 from fastrod.kernels.rod.modal.workspace import modal_workspace
-from fastrod.model.robot import Robot
+from fastrod.model.robot import Robot, Segment
 from fastrod.solver.options import Modes, SchemeName
 from fastrod.solver.protocol import Acting
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
@@ -113,7 +113,7 @@ def cut(robots: Sequence[Robot], layout: Layout, per_segment: int) -> ModalPiece
     n_segments = len(layout.first_tendon)
     segment = np.repeat(np.arange(n_segments), per_segment)
     start = np.tile(np.arange(per_segment) / per_segment, n_segments)
-    rows = [[_inertia(s.line_density, s.body_radius) for s in robot.segments] for robot in robots]
+    rows = [[_inertia(s) for s in robot.segments] for robot in robots]
     axial = [
         [(s.shear_stiffness, s.shear_stiffness, s.axial_stiffness) for s in robot.segments]
         for robot in robots
@@ -156,10 +156,11 @@ def _directors(robots: Sequence[Robot]) -> Floats:
     return np.asarray(0.5 * inertia.sum(2, keepdims=True) - inertia)
 
 
-def _inertia(density: float, radius: float) -> tuple[float, float, float]:
-    """Mass per length, and its second moments of a round cross-section about d2 and d1."""
-    rotary = 0.25 * density * radius * radius
-    return density, rotary, rotary
+def _inertia(segment: Segment) -> tuple[float, float, float]:
+    """Mass per length, and its second moments of the cross-section about d2 and d1."""
+    radius = segment.gyration_radius or 0.5 * segment.body_radius
+    rotary = segment.line_density * radius * radius
+    return segment.line_density, rotary, rotary
 
 
 def no_points(n_robots: int) -> ModalPoints:

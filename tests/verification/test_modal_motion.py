@@ -72,6 +72,24 @@ def test_it_rings_as_a_cantilever_does(mass: float, pieces: int, third: float) -
     assert_allclose(found[4:], expected[4:], rtol=third)
 
 
+def test_torsion_rings_by_the_radius_of_gyration() -> None:
+    """c / 4 l of a clamped rod, c^2 = GJ / (2 rho r^2); a body that is wider for contact rings alike."""
+    radius, stiff, density, length = 0.01, 0.008, 0.05, 0.1
+    wide = Segment(
+        length=length,
+        bending_stiffness=(0.5, 0.5),
+        torsional_stiffness=stiff,
+        line_density=density,
+        body_radius=0.03,
+        gyration_radius=radius,
+        mode="passive",
+    )
+    sim = Simulator(Robot(name="wide", segments=(wide,), gravity=(0.0, 0.0, 0.0)), dynamics=True)
+    sim.settle()
+    expected = np.sqrt(stiff / (2.0 * density)) / (4.0 * length * radius)
+    assert_allclose(np.abs(sim.frequencies(8)[0] - expected).min(), 0.0, atol=1e-4 * expected)
+
+
 def test_a_disk_slows_torsion_and_bend_as_its_inertia_says() -> None:
     """A light rod with a heavy disk: GJ / l against I_3; 4 EI / l and 12 EI / l^3 of a beam's end."""
     light = beam(Lump(at=LENGTH, mass=0.3, inertia=(2e-3, 3e-3, 4.5e-3)), line_density=1e-7)
