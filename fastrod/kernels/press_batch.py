@@ -101,6 +101,7 @@ def press_some(
         np.empty((m, 4), np.int64),
         np.empty((m, 3, 3)),
         np.empty((m, 3, n)),
+        np.empty((m, 3, n)),
         np.empty((m, 3)),
         np.empty((m, 5)),
         np.empty((m, 3, 3)),

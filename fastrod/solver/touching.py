@@ -38,7 +38,7 @@ from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
-_FOLLOWING = 4  # first steps to a rest, in which they do
+_FOLLOWING = 8  # first steps to a rest, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step uses are updated
 _STILL = 1e-6  # rad: a Newton step below it is the last one
@@ -374,7 +374,7 @@ class TouchingRods(ModalRods):
             still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
             renew_some(left, *seen, near, n_found, still)
             if engine.rods_meet:
-                closer = 0.1 * _INSIDE if still else _SAME_GAP
+                closer = 0.01 * _INSIDE if still else _SAME_GAP
                 search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
             modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))

@@ -30,6 +30,7 @@ def world(rng, m, n, mu):
         side,
         np.tile(np.eye(3), (m, 1, 1)),
         rng.normal(size=(m, 3, n)),
+        np.zeros((m, 3, n)),
         1e-3 * rng.normal(size=(m, 3)),
         law,
         np.zeros((m, 3, 3)),

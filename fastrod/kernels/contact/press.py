@@ -58,6 +58,8 @@ class PressedWorld(NamedTuple):
     """(n_contacts, 3, 3) normal and two tangents."""
     along: Floats
     """(n_contacts, 3, n) J: motion along these."""
+    centre: Floats
+    """(n_contacts, 3, n) motion of the centreline along these, without the arm on which friction acts."""
     free: Floats
     """(n_contacts, 3) gap and slip without a step [m]."""
     law: Floats
@@ -464,6 +466,9 @@ def gather_world(
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
+            for r in range(3):
+                for a in range(most):
+                    pressing.centre[m, r, a] = pressing.along[m, r, a]
             if law[0] > 0.0:
                 _add_arm(m, o, i, q, 1.0, all_of_it, pressing)
                 if other >= 0:
@@ -623,7 +628,7 @@ def _rotate_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
     there is any."""
     some = False
     for k in range(m):
-        axes, c, along = pressing.axes[k], pressing.curved[k], pressing.along[k]
+        axes, c, along = pressing.axes[k], pressing.curved[k], pressing.centre[k]
         force = contacts.contact[pressing.side[k, 0], pressing.side[k, 1]].force
         pressed = force[0] * axes[0, 0] + force[1] * axes[0, 1] + force[2] * axes[0, 2]
         if not pressed > 0.0 or c[1, 1] + c[2, 2] == 0.0:

@@ -45,7 +45,8 @@ def legendre_at(x: Floats | float, n_degrees: int) -> Floats:
     """(..., n_degrees) Legendre polynomials of [0, 1] at x."""
     x = np.asarray(x, dtype=np.float64)
     values = np.asarray(legendre.legvander(2.0 * x - 1.0, n_degrees - 1), dtype=np.float64)
-    return values.reshape(*x.shape, n_degrees)
+    # contiguous, as it comes out of a pickle: kernels would be compiled anew for another layout
+    return np.ascontiguousarray(values.reshape(*x.shape, n_degrees))
 
 
 @cache
