@@ -74,8 +74,8 @@ class Simulator(RobotBatch):
         ends after its one pass, where the search for a shape that does not exist takes some thousand.
 
         `contact` is what the rods may touch; without it they pass through everything. Without `feel_contact`
-        they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone.
-        Rods of modes feel it in motion too.
+        they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone. The
+        observer's robots are rods of modes for as long as they touch something.
 
         `threads` defaults to numba's. With `device="cuda"` the observer's passes run on an NVIDIA GPU, one
         thread a robot, from the same source: numbers agree to rounding. The memory of the observer stays

@@ -49,8 +49,7 @@ class Observer:
     """V^-1, variance of a boundary residual times time [m^2 s]; with a process noise."""
     kept_jacobian_tolerance: Annotated[float, NOT_NEGATIVE] = 0.0
     """Residual [m] below which a step corrects the boundary by the Jacobian that it has (chord Newton),
-    without new sensitivities: a third of the time, and the observer lags by about so much. A robot that feels
-    contact takes new ones."""
+    without new sensitivities: a third of the time, and the observer lags by about so much."""
 
     def __post_init__(self) -> None:
         check(self)
