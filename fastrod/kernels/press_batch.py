@@ -77,7 +77,7 @@ def press_some(
     hessian: Floats,
     gradient: Floats,
     change: Floats,
-    turn: Floats,
+    spin: Floats,
     first: int,
     gone: Floats,
     yielding: float,
@@ -85,9 +85,9 @@ def press_some(
     still: bool,
     step: Floats,
     changed: Flags,
-    ways: Floats,
+    gone_now: Floats,
 ) -> None:
-    """Step (n_robots, n_q) and forces of these worlds (`press`), whose slips were renewed, and the `ways`
+    """Step (n_robots, n_q) and forces of these worlds (`press`), whose slips were renewed, and the `gone_now`
     (n_robots, n_obstacles, 6) that free bodies go, as `Touching.gone`."""
     n_q, most, n_rows = gradient.shape[1], contacts.contact.shape[1], 0
     for k in range(len(start) - 1):
@@ -112,7 +112,7 @@ def press_some(
         np.empty((2, n)),
     )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
-    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, turn, first, gone, yielding)
+    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, gone, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
         renewed = press(count, unknowns, contacts, pressing, renew, still)
@@ -123,7 +123,7 @@ def press_some(
                 step[i, a] = pressing.step[o * n_q + a]
             for b in range(len(surfaces.primitive) if surfaces.mobility[:, 0].any() else 0):
                 for a in range(6):
-                    ways[i, b, a] = pressing.step[
+                    gone_now[i, b, a] = pressing.step[
                         (start[k + 1] - start[k]) * n_q + 6 * body_of(b, surfaces) + a
                     ]
 

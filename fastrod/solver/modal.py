@@ -258,7 +258,9 @@ class ModalSolver:
             for c in range(3):
                 some = np.flatnonzero(basis.component == c)
                 modes = samples.here[here][:, basis.degree[some]]
-                q[rows[:, None], p * n_modes + some] = bent[:, :, c] @ np.linalg.pinv(modes).T
+                q[rows[:, None], p * n_modes + some] = np.einsum(
+                    "nm,am->na", bent[:, :, c], np.linalg.pinv(modes)
+                )
 
     def start_straight(self, rows: Ints) -> None:
         """Let these robots begin from their shape without loads."""
@@ -414,14 +416,14 @@ class ModalSolver:
             "inertia": (m,),
             "point": (n_points, 3),
             "point_change": (n_points, 3, n_q),
-            "point_turn": (n_points, 3, n_q),
+            "point_rotation": (n_points, 3, n_q),
         }
         left_out = {"hessian", "mass", "damping", "number", "point"} - set(wanted)
         left_out -= {"number"} if followed else set()
         if "number" in left_out:
             left_out |= {"number_change", "inertia"}
         if "point" in left_out:
-            left_out |= {"point_change", "point_turn"}
+            left_out |= {"point_change", "point_rotation"}
         found = ModalDerivatives(
             *(np.zeros((0 if name in left_out else n, *shape)) for name, shape in shapes.items())
         )

@@ -21,11 +21,11 @@ from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, Ro
 
 
 class RestingMemory(NamedTuple):
-    """What both remember, and who is whose."""
+    """Memory of both solvers, and whose last shape is one of modes."""
 
     boundary: Memory
     modes: ModalMemory
-    touches: Flags
+    by_modes: Flags
 
 
 class Either(NamedTuple):
@@ -33,16 +33,16 @@ class Either(NamedTuple):
 
     free: LinearResponse
     pressed: LinearResponse
-    touches: Flags
+    by_modes: Flags
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
         """(n_robots, 6, n_inputs) of the tip."""
         both = (each.jacobian(relocate, turning) for each in (self.pressed, self.free))
-        return np.where(self.touches[:, None, None], *both)
+        return np.where(self.by_modes[:, None, None], *both)
 
     def by_force(self) -> Floats:
         """(n_robots, 6, 3) of the tip, by a force on it."""
-        return np.where(self.touches[:, None, None], self.pressed.by_force(), self.free.by_force())
+        return np.where(self.by_modes[:, None, None], self.pressed.by_force(), self.free.by_force())
 
 
 class RestingRods:
@@ -72,7 +72,7 @@ class RestingRods:
         shared: Any = {"dt": dt, "outputs": "full", "threads": threads}
         self.free = ObserverSolver(options, layout, params, n_robots, **{**named, **shared})
         self.pressed = TouchingRods(engine, Modal(), robots, layout, params, n_robots, **shared)
-        self._touches = np.zeros(n_robots, bool)  # whose last shape is one of modes
+        self._by_modes = np.zeros(n_robots, bool)  # whose last shape is one of modes
 
     def accept(self, given: Inputs, how: How | None) -> None:
         """Raise `InputError` for what the observer does not take."""
@@ -98,25 +98,25 @@ class RestingRods:
     def _solved(
         self, rows: Ints, acting: Acting, last: Last, tolerance: float, by_observer: Callable[[Ints], Solved]
     ) -> Solved:
-        engine, touches = self.engine, self._touches
+        engine, by_modes = self.engine, self._by_modes
         cold = engine.whole_worlds(self._mask(rows) & ~last.warm)
         engine.begin_anew(cold)
-        touches[cold] = False
+        by_modes[cold] = False
         pressed = engine.pressed()
         free = rows[~pressed[rows]]
-        self._hand_back(free[touches[free]], last)
+        self._resume(free[by_modes[free]], last)
         solved = by_observer(free)
         shape, ok = solved.shape, solved.ok.copy()
         meets = pressed | engine.overlap(free[ok[free]], shape)
         if len(some := rows[meets[rows]]):
             found = self.pressed.begin(acting)
             if engine.before is not None and last.ports is not None:
-                self.pressed.take_over(some[~(touches | cold)[some]], engine.before, last.ports, found)
+                self.pressed.take_over(some[~(by_modes | cold)[some]], engine.before, last.ports, found)
             ok[some] = self.pressed.rest_pressed(some, cold, acting, last, found, tolerance)[some]
             for ours, theirs in zip(shape, found.shape, strict=True):
                 ours[some] = theirs[some]
             more = self.pressed.end(some, ok, found, acting, last)
-            touches[some] = True
+            by_modes[some] = True
             passes = np.where(meets, more.passes, solved.passes)
             solved = solved._replace(
                 ok=ok, passes=passes, problems=more.problems, held=more.held, jacobian=None
@@ -126,43 +126,43 @@ class RestingRods:
         engine.accept(rows[ok[rows]], shape)
         return solved
 
-    def _hand_back(self, rows: Ints, last: Last) -> None:
+    def _resume(self, rows: Ints, last: Last) -> None:
         """Let the observer go on from the last shape of these robots, and learn the gain there."""
         shape, ports, passes = self.engine.before, last.ports, self.free.passes
-        self._touches[rows] = False
+        self._by_modes[rows] = False
         if not len(rows) or shape is None or ports is None:
             return
         memory, n_free = passes.memory, len(passes.layout.free_tendon)
         memory.x[rows, :3] = shape.moment[rows, 0]
         memory.x[rows, 3 : 3 + n_free] = shape.tension[rows][:, passes.layout.free_tendon]
         if len(ports.follower_force):
-            force = np.broadcast_to(ports.follower_force, (len(self._touches), 3))[rows]
+            force = np.broadcast_to(ports.follower_force, (len(self._by_modes), 3))[rows]
             memory.x[rows, -3:] = np.einsum("nij,nj->ni", shape.tip_rotation[rows], force)
         memory.curvature_guess[rows] = shape.curvature[rows, 0]
         passes.arrive_at(rows, ports)
         self.free.learn(rows, ports)
 
     def _mask(self, rows: Ints) -> Flags:
-        return np.isin(np.arange(len(self._touches)), rows)
+        return np.isin(np.arange(len(self._by_modes)), rows)
 
     def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape, contact forces held."""
-        free = self.free.response(acting, warm & ~self._touches)
-        if not (touches := self._touches & warm).any():
+        free = self.free.response(acting, warm & ~self._by_modes)
+        if not (by_modes := self._by_modes & warm).any():
             return free
-        return Either(free, self.pressed.linear(acting, touches), touches)
+        return Either(free, self.pressed.linear(acting, by_modes), by_modes)
 
     def tip_compliance(self, acting: Acting, warm: Flags, *, in_step: bool) -> Floats:
         """(n_robots, 3, 3) by how much the tip gives to a force [m/N]."""
-        free = self.free.tip_compliance(acting, warm & ~self._touches, in_step=in_step)
-        if not (touches := self._touches & warm).any():
+        free = self.free.tip_compliance(acting, warm & ~self._by_modes, in_step=in_step)
+        if not (by_modes := self._by_modes & warm).any():
             return free
-        pressed = self.pressed.tip_compliance(acting, touches, in_step=in_step)
-        return np.where(touches[:, None, None], pressed, free)
+        pressed = self.pressed.tip_compliance(acting, by_modes, in_step=in_step)
+        return np.where(by_modes[:, None, None], pressed, free)
 
     def unstable(self, acting: Acting, shape: RodShape, rows: Ints) -> Ints:
         """Those of `rows` that touch nothing, and whose shape balances its loads but would not stay."""
-        return self.free.unstable(acting, shape, rows[~self._touches[rows]])
+        return self.free.unstable(acting, shape, rows[~self._by_modes[rows]])
 
     def replace(self, robots: Sequence[Robot]) -> None:
         """Take other robots of the same layout, one for all or one each."""
@@ -170,7 +170,7 @@ class RestingRods:
 
     def snapshot(self) -> RestingMemory:
         """Return a copy of what is remembered."""
-        return RestingMemory(self.free.snapshot(), self.pressed.snapshot(), self._touches.copy())
+        return RestingMemory(self.free.snapshot(), self.pressed.snapshot(), self._by_modes.copy())
 
     def check(self, kept: object) -> None:
         """Raise `InputError` where this is no snapshot of such rods."""
@@ -185,4 +185,6 @@ class RestingRods:
         """Go back to a snapshot, or in these robots alone."""
         self.free.restore(kept.boundary, rows, acting, then)
         self.pressed.restore(kept.modes, rows, acting, then)
-        self._touches = kept.touches.copy() if rows is None else np.where(rows, kept.touches, self._touches)
+        self._by_modes = (
+            kept.by_modes.copy() if rows is None else np.where(rows, kept.by_modes, self._by_modes)
+        )

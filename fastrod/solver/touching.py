@@ -78,7 +78,7 @@ class TouchingRods(ModalRods):
         self._blocked, self._through, self._full = np.zeros((3, self.n_robots), bool)
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
         # of free bodies: in a step, and in a rest until then (`Touching.gone`)
-        self._ways, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
+        self._gone_now, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
         self._late = np.zeros(self.n_robots)  # largest step since contacts stayed where they were [rad]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
@@ -205,10 +205,10 @@ class TouchingRods(ModalRods):
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
             self._blocked[fresh[~clear[fresh]]] = True
         engine.slides[rows] = ~cold[rows]  # who comes from nowhere has not slipped
-        ok, done, part, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
+        ok, done, fraction, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
         size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
         for _ in range(_MOST_STEPS if len(left) else 0):
-            aim = np.minimum(done + part, 1.0)
+            aim = np.minimum(done + fraction, 1.0)
             follow = there < _FOLLOWING
             for each, follows in itertools.product(np.unique(size[left]), (False, True)):
                 some = left[(size[left] == each) & (follow[left] == follows)]
@@ -219,7 +219,7 @@ class TouchingRods(ModalRods):
                 was, how = modal.motion.place.copy(), Step(BDF1, float(each))
                 well = self._one(some, acting, inputs, how, (done.copy(), aim), found, follows)
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
-                done[well], self._gone[well] = aim[well], self._ways[well]
+                done[well], self._gone[well] = aim[well], self._gone_now[well]
                 arrived = well & (done >= 1.0)
                 there += arrived
                 engine.place_at_once(arrived)
@@ -230,7 +230,7 @@ class TouchingRods(ModalRods):
                     moved &= (self._late > _LATE) | (self._deep > _SAME_PLACE)
                 ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
                 size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), _FALLS * each)
-                part[some] *= np.where(well[some], 4.0, 0.25)
+                fraction[some] *= np.where(well[some], 4.0, 0.25)
             left = left[~ok[left] & (size[left] > _GIVEN_UP)]
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
@@ -383,12 +383,12 @@ class TouchingRods(ModalRods):
                 d.hessian,
                 d.gradient,
                 d.point_change,
-                d.point_turn,
+                d.point_rotation,
                 acting.points[0].shape[1],
                 self._gone,
                 yielding,
             )
-            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._ways))
+            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._gone_now))
             q[left] += step[left]
             size[left] = np.abs(unit * step[left]).max(1)
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
@@ -398,7 +398,9 @@ class TouchingRods(ModalRods):
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):
             modal.place_points(self._points(arrived, acting), ports.extension)
-            modal.hold(arrived, ports, *found, how, q, True)
+            # at rest what is shown has none of the inertia of the way there
+            ends = how if self.dynamics else how._replace(dt=_LONGEST)
+            modal.hold(arrived, ports, *found, ends, q, True)
             end_some(arrived, contacts)
         failed = rows[~ok[rows]]
         self._through[failed], self._full[failed] = (

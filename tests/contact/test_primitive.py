@@ -137,7 +137,8 @@ def test_a_rod_on_an_ellipsoid_rests_as_on_its_fine_mesh():
     assert_allclose(*shapes, rtol=0, atol=1e-5)
     forces = [np.nansum(s.contacts.force[0], axis=0) for s in (smooth, faceted)]
     assert np.linalg.norm(forces[0]) > 0.1
-    assert_allclose(forces[0], forces[1], rtol=0, atol=0.01 * np.linalg.norm(forces[0]))
+    # half a facet turns a normal by 0.7 degrees where the ellipsoid is most curved
+    assert_allclose(forces[0], forces[1], rtol=0, atol=0.02 * np.linalg.norm(forces[0]))
 
 
 def flat(size, p):

@@ -36,21 +36,21 @@ def test_a_moment_works_on_the_rotation_of_its_cross_section() -> None:
         return np.stack([(of(q + e) - of(q - e)) / (2.0 * STEP) for e in unit], axis=1)
 
     here, loaded = at(q, force), at(q, force, moment)
-    turn = here.point_turn[0]
+    turn = here.point_rotation[0]
     assert_allclose(
         loaded.gradient[0] - here.gradient[0], -np.einsum("kf,kfa->a", moment[0], turn), atol=1e-15
     )
 
-    by_moment = slopes(lambda q: -np.einsum("kf,kfa->a", moment[0], at(q, force).point_turn[0]))
+    by_moment = slopes(lambda q: -np.einsum("kf,kfa->a", moment[0], at(q, force).point_rotation[0]))
     lower = np.tril(loaded.hessian[0] - here.hessian[0])
     assert_allclose(lower, np.tril(by_moment), atol=1e-6 * np.abs(by_moment).max())
 
     def gradient(q_new: Any) -> Any:
         """Of the energy with forces on arms that have turned by the way, to second order."""
         found = at(q_new, force)
-        by = np.einsum("kfa,a->kf", 0.5 * (found.point_turn[0] + turn), (q_new - q)[0])
+        by = np.einsum("kfa,a->kf", 0.5 * (found.point_rotation[0] + turn), (q_new - q)[0])
         now = arm[0] + np.cross(by, arm[0] + 0.5 * np.cross(by, arm[0]))
-        return found.gradient[0] - np.einsum("kf,kfa->a", np.cross(now, force[0]), found.point_turn[0])
+        return found.gradient[0] - np.einsum("kf,kfa->a", np.cross(now, force[0]), found.point_rotation[0])
 
     one, other = np.einsum("kf,kfa->ka", force[0], turn), np.einsum("kf,kfa->ka", arm[0], turn)
     more = -0.5 * (np.einsum("ka,kb->ab", one, other) + np.einsum("ka,kb->ab", other, one))

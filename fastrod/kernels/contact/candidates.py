@@ -1,4 +1,4 @@
-"""Where a rod may touch: candidates of each robot, and from them its contacts for the next pass."""
+"""Places where a rod may touch: candidates of each robot, and its contacts for the next pass."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class Touching(NamedTuple):
     """(n_robots, n_q) with these."""
     change: Floats
     """(n_robots, n_points, 3, n_q) motion of points by the unknowns, world."""
-    turn: Floats
+    spin: Floats
     """(n_robots, n_points, 3, n_q) and rotation of the cross-sections there."""
     first: int
     """Number of the first contact among these points."""
@@ -236,7 +236,7 @@ def _note_shift(
     along = tangent_at(curve, j, x)
     t = (dot(along, _axis(axes, 0)), dot(along, _axis(axes, 1)), dot(along, _axis(axes, 2)))
     across = cross(along, _axis(axes, 0))
-    n_q, turn = all_of_it.change.shape[3], all_of_it.turn[i, all_of_it.first + q]
+    n_q, spin = all_of_it.change.shape[3], all_of_it.spin[i, all_of_it.first + q]
     for a in range(n):
         value = 0.0
         for r in range(1, 3):
@@ -244,7 +244,7 @@ def _note_shift(
                 value += t[r] * curved[r, c] * pressing.along[m, c, a]
         out[a] = sign * value
     for a in range(n_q):
-        turned = across[0] * turn[0, a] + across[1] * turn[1, a] + across[2] * turn[2, a]
+        turned = across[0] * spin[0, a] + across[1] * spin[1, a] + across[2] * spin[2, a]
         out[row * n_q + a] += sign * turned
     return t
 
@@ -279,8 +279,8 @@ def _let_slide(
     all_of_it: Touching,
     pressing: PressedWorld,
 ) -> None:
-    """How the place of contact m moves along the rods with the unknowns: where the gap is least, its slopes
-    along them are 0. Not where that is nearly everywhere: on what is as curved as the rod."""
+    """Note how the place of contact m moves along the rods with the unknowns: where the gap is least, its
+    slopes along them are 0. Not where that is nearly everywhere: on what is as curved as the rod."""
     contact, yields, least = all_of_it.contacts.contact, pressing.yields[m], 1.0 / all_of_it.rods.length[i]
     yields[0], yields[1], yields[2] = 0.0, 0.0, 0.0
     here = _slides_along(i, contact[i, q].arclength, all_of_it)
@@ -330,29 +330,29 @@ def _add_arm(
     """Friction acts on the surface: add to the motion of contact m along it that of the arm from the
     centreline there, A = - radius n, which turns with the rod."""
     axes, contact, n_q = pressing.axes[m], all_of_it.contacts.contact[i, q], all_of_it.change.shape[3]
-    turn, n = all_of_it.turn[i, all_of_it.first + q], normal_of(contact)
+    spin, n = all_of_it.spin[i, all_of_it.first + q], normal_of(contact)
     arm, force = scale(-contact.radius, n), (contact.force[0], contact.force[1], contact.force[2])
     rubs = axpy(-dot(force, n), n, force)
     for r in range(1, 3):
         across = cross(arm, _axis(axes, r))
         for a in range(n_q):
-            turned = across[0] * turn[0, a] + across[1] * turn[1, a] + across[2] * turn[2, a]
+            turned = across[0] * spin[0, a] + across[1] * spin[1, a] + across[2] * spin[2, a]
             pressing.along[m, r, row * n_q + a] += sign * turned
     if dot(rubs, rubs) > 0.0:
-        _add_arm_stiffness(row, n_q, turn, arm, rubs, pressing)
+        _add_arm_stiffness(row, n_q, spin, arm, rubs, pressing)
 
 
 @kernel
-def _add_arm_stiffness(row: int, n_q: int, turn: Floats, arm: Vec, rubs: Vec, pressing: PressedWorld) -> None:
+def _add_arm_stiffness(row: int, n_q: int, spin: Floats, arm: Vec, rubs: Vec, pressing: PressedWorld) -> None:
     """Add to the Hessian the second derivatives of a force on an arm that turns with the rod, beyond those of
     its moment M as a dead load, which the rod has: - f . sym (th_a x (th_b x A)), and, for rotations do not
     commute and the rod takes th_a by the unknowns in one order, M . (th_b x th_a) / 2."""
     moment = cross(arm, rubs)
     for a in range(n_q):
-        one = (turn[0, a], turn[1, a], turn[2, a])
+        one = (spin[0, a], spin[1, a], spin[2, a])
         by_force, by_arm = dot(rubs, one), dot(arm, one)
         for b in range(a + 1):
-            other = (turn[0, b], turn[1, b], turn[2, b])
+            other = (spin[0, b], spin[1, b], spin[2, b])
             more = 0.5 * (
                 dot(moment, cross(other, one)) - by_force * dot(arm, other) - by_arm * dot(rubs, other)
             )

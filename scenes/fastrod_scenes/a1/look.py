@@ -143,7 +143,7 @@ class NeckLook(HostedScene):
             math.inf,
             0.0,
         )
-        carried, reach = 0.0, stage.robot.length
+        carried, before = 0.0, stage.robot.length
         for t in self.play(stage):
             state = rod.state
             assert state is not None
@@ -155,8 +155,8 @@ class NeckLook(HostedScene):
             weighed += self.dt / self.duration * (float(rod.wrench[2]) + 0.4 * length * 9.81)
             # what is paid out is as fast as what there was
             carries = float(rod.simulator.momentum()[0, 2])
-            weighed += (carries - carried * length / reach) / self.duration
-            carried, reach = carries, length
+            weighed += (carries - carried * length / before) / self.duration
+            carried, before = carries, length
             gave = max(
                 gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood))
             )

@@ -91,7 +91,7 @@ class ModalDerivatives(NamedTuple):
     """(n_robots, n_points, 3) place of every point force, world [m]."""
     point_change: Floats
     """(n_robots, n_points, 3, n_q) its derivatives by the unknowns."""
-    point_turn: Floats
+    point_rotation: Floats
     """(n_robots, n_points, 3, n_q) rotation of the cross-section there by the unknowns."""
 
 
@@ -254,7 +254,7 @@ def write_points(
                         turned = axpy(slope[j], get(work.column[p, a % n_modes, j], C_TH, w), turned)
                 for f in range(3):
                     out.point_change[i, q, f, a] = moved[f]
-                    out.point_turn[i, q, f, a] = turned[f]
+                    out.point_rotation[i, q, f, a] = turned[f]
 
 
 @kernel
@@ -285,7 +285,7 @@ def write_base(
                 moved = cross(axis, sub(place, base)) if r >= 3 else axis
                 for f in range(3):
                     out.point_change[i, q, f, a] = moved[f]
-                    out.point_turn[i, q, f, a] = axis[f] if r >= 3 else 0.0
+                    out.point_rotation[i, q, f, a] = axis[f] if r >= 3 else 0.0
 
 
 @kernel

@@ -60,14 +60,19 @@ def _points(n: int) -> tuple[Floats, Floats, Floats]:
     return x, coefficients, np.asarray(0.5 * legendre.legint(coefficients, lbnd=-1, axis=0))
 
 
+def _times(values: Floats, table: Floats) -> Floats:
+    """`values` @ `table`, of each row alone: BLAS rounds by how many there are."""
+    return np.asarray(np.einsum("...k,kj->...j", values, table))
+
+
 def integral_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
     """(..., N + 1) row of S for a place that is no node: position there is r_0 + l sum of row_j t_j."""
-    return np.asarray(legendre_at(x, n + 2) @ _points(n)[2])
+    return _times(legendre_at(x, n + 2), _points(n)[2])
 
 
 def lagrange_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
     """(..., N + 1) Lagrange polynomials of the nodes at x."""
-    return np.asarray(legendre_at(x, n + 1) @ _points(n)[1])
+    return _times(legendre_at(x, n + 1), _points(n)[1])
 
 
 @cache
