@@ -360,7 +360,7 @@ class TouchingRods(ModalRods):
             violations(worlds, search, engine.surfaces, near, n_found, deep)
             if self._is_rigid:  # the whole rod, and not what its candidates show
                 np.maximum(deep, -engine.clearance.gap, out=deep)
-            if count and not self.dynamics:  # it is led there by a shorter way
+            if count and not self.dynamics:  # who asks for the rest tries a shorter step
                 gone |= engine.whole_worlds(through)
                 self._note_nearest(left[gone[left]], near[gone[left]], n_found[gone[left]])
                 left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]

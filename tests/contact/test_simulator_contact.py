@@ -11,6 +11,7 @@ from contact.robots import bent, passive, prototype
 from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
+from fastrod import Modal, Modes
 from fastrod.contact import ContactScene, box, cylinder, mesh, plane, sphere
 from fastrod.errors import FastrodError
 
@@ -189,7 +190,8 @@ def test_a_rising_bar_lifts_a_heavy_rod():
     weight = 0.3 * 9.81 * robot.length
     assert state.contacts.wrench[0, 0, 2] + state.base_wrench[0, 2] == pytest.approx(-weight, abs=1e-6)
     assert state.contacts.wrench[0, 0, 2] < -0.2 * weight
-    assert state.contacts.clearance[0] > -2e-8
+    pressed = np.linalg.norm(state.contacts.force[0], axis=1).max()
+    assert state.contacts.clearance[0] > -1e-8 * pressed - 1e-9  # 1e-8 m under a newton
 
 
 def test_thousands_of_small_steps_end_where_settle_does():
@@ -331,12 +333,11 @@ def test_compliance_and_jacobian_hold_the_contact_forces():
     forces as loads."""
     sim = fastrod.Simulator(prototype(1e-5), contact=bar())
     state = sim.settle(bent(12.0, 1.0))
-    free = fastrod.Simulator(prototype(1e-5))
+    free = fastrod.Simulator(prototype(1e-5), solver=Modal(modes=Modes(6, 4, pieces=2)))
     loads = list(zip(state.contacts.arclength[0], state.contacts.force[0], strict=True))
     free.settle(bent(12.0, 1.0), point_force=loads)
-    # a force between two nodes makes a kink in the curvature, which modes round off
-    for one, other in ((sim.jacobian(), free.jacobian()), (sim.compliance(), free.compliance())):
-        assert_allclose(one[:, :, :4], other[:, :, :4], rtol=0, atol=1e-3 * np.abs(other).max())
+    assert_allclose(sim.jacobian()[:, :, :4], free.jacobian()[:, :, :4], rtol=1e-4, atol=1e-6)
+    assert_allclose(sim.compliance(), free.compliance(), rtol=1e-4, atol=1e-6)
 
 
 def test_a_snapshot_holds_the_contacts():
