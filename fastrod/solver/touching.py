@@ -344,7 +344,8 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
-        size, deep, ok, gone = np.full(n, np.inf), self._deep, np.zeros(n, bool), np.zeros(n, bool)
+        size, over = np.full((2, n), np.inf)  # last step, and what it leaves to be done [rad]
+        deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
         for count in range(most + 1):
@@ -364,7 +365,7 @@ class TouchingRods(ModalRods):
                 gone |= engine.whole_worlds(through)
                 self._note_nearest(left[gone[left]], near[gone[left]], n_found[gone[left]])
                 left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]
-            busy = (size >= _STILL) | changed | (deep > _INSIDE) | through
+            busy = (over >= _STILL) | changed | (deep > _INSIDE) | through
             ok |= self._mask(left) & ~engine.whole_worlds(busy & self._mask(left))
             keep = ~ok[left]
             left, near, n_found = left[keep], near[keep], np.maximum(n_found[keep], 0)
@@ -390,7 +391,11 @@ class TouchingRods(ModalRods):
             )
             self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._gone_now))
             q[left] += step[left]
-            size[left] = np.abs(unit * step[left]).max(1)
+            last, size[left] = size[left], np.abs(unit * step[left]).max(1)
+            # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
+            known = self.dynamics and count > moving
+            by = np.minimum(size[left] / np.maximum(last, 1e-300), 0.5) if known else np.full(len(left), 0.5)
+            over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
             self._passes[left] += 1
             lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
