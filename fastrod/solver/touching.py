@@ -38,7 +38,7 @@ from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
-_FOLLOWING = 8  # first steps to a rest, in which they do
+_FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step uses are updated
 _STILL = 1e-6  # rad: a Newton step below it is the last one
@@ -209,7 +209,7 @@ class TouchingRods(ModalRods):
         size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
         for _ in range(_MOST_STEPS if len(left) else 0):
             aim = np.minimum(done + fraction, 1.0)
-            follow = there < _FOLLOWING
+            follow = there < (_FOLLOWING if tolerance >= AT_REST else _SETTLING)
             for each, follows in itertools.product(np.unique(size[left]), (False, True)):
                 some = left[(size[left] == each) & (follow[left] == follows)]
                 if not len(some):
