@@ -68,6 +68,8 @@ class Engine:
         self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
+        self.slips_from: tuple[RodShape, Floats] | None = None
+        """Shape and obstacles from which slip is counted, where that is not from `before`."""
         self._broad: BroadPhase | None = None  # of scenes by FCL
 
     def __getstate__(self) -> dict[str, Any]:
@@ -236,20 +238,22 @@ class Engine:
     def motion(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> ContactMotion:
         """Rods in `shape` and the obstacles at the fraction `aim` of their displacement, where the fraction
         `done` is behind."""
-        if self.poses is self.poses_before and not self.velocities:
+        came = shape if self.before is None else self.before
+        origin, began = (came, None) if self.slips_from is None else self.slips_from
+        if self.poses is self.poses_before and not self.velocities and began is None:
             frames = before = slip = frames_of(self.poses)
         else:
             poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
-            ago = last.repeat(max(len(poses), 1) // max(len(last), 1), axis=0) if self.velocities else last
+            ago = last if began is None else began
+            ago = ago.repeat(max(len(poses), 1) // max(len(ago), 1), axis=0) if self.velocities else ago
             for k, velocity in self.velocities.items():
-                slid = back_by(poses[:, k], velocity, self.dt * (aim - done))
+                slid = back_by(poses[:, k], velocity, self.dt * (aim - done if began is None else aim))
                 ago = ago.repeat(len(slid) // len(ago), axis=0)
                 ago[:, k] = slid
             frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
         return motion_of(
             (frames, before, slip),
-            shape,
-            shape if self.before is None else self.before,
+            (shape, came, origin),
             self.clearance,
             tracked=self.tracked,
             slides=self.tracked & self.slides,
@@ -268,8 +272,7 @@ def starts_of(world: Ints) -> Ints:
 
 def motion_of(
     frames: tuple[Floats, Floats, Floats],
-    shape: RodShape,
-    before: RodShape,
+    shapes: tuple[RodShape, RodShape, RodShape],
     clearance: Clearance,
     *,
     tracked: Flags,
@@ -277,10 +280,9 @@ def motion_of(
     tolerance: float,
     margin: float,
 ) -> ContactMotion:
-    """Put together what kernels read of one pass: `frames` now, before, and for slip."""
-    return ContactMotion(
-        *frames, *_curves(shape), *_curves(before), *clearance, tracked, slides, tolerance, margin
-    )
+    """Put together what kernels read of one pass: `frames` and `shapes` now, before, and for slip."""
+    now, came, origin = (_curves(shape) for shape in shapes)
+    return ContactMotion(*frames, *now, *came, *origin, *clearance, tracked, slides, tolerance, margin)
 
 
 def _curves(shape: RodShape) -> tuple[Floats, Floats, Floats, Floats]:

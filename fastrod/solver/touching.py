@@ -77,8 +77,6 @@ class TouchingRods(ModalRods):
         # contacts were as many as there may be
         self._blocked, self._through, self._full = np.zeros((3, self.n_robots), bool)
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
-        # of free bodies: in a step, and in a rest until then (`Touching.gone`)
-        self._gone_now, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
         self._late = np.zeros(self.n_robots)  # largest step since contacts stayed where they were [rad]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
@@ -205,6 +203,8 @@ class TouchingRods(ModalRods):
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
             self._blocked[fresh[~clear[fresh]]] = True
         engine.slides[rows] = ~cold[rows]  # who comes from nowhere has not slipped
+        if engine.before is not None:  # over all the parts of a rest, slip is that of the step
+            engine.slips_from = engine.before, engine.poses_before
         ok, done, fraction, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
         size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
         for _ in range(_MOST_STEPS if len(left) else 0):
@@ -219,7 +219,7 @@ class TouchingRods(ModalRods):
                 was, how = modal.motion.place.copy(), Step(BDF1, float(each))
                 well = self._one(some, acting, inputs, how, (done.copy(), aim), found, follows)
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
-                done[well], self._gone[well] = aim[well], self._gone_now[well]
+                done[well] = aim[well]
                 arrived = well & (done >= 1.0)
                 there += arrived
                 engine.place_at_once(arrived)
@@ -235,7 +235,8 @@ class TouchingRods(ModalRods):
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
                 break
-        engine.slides[rows], self._gone[rows] = True, 0.0
+        engine.slides[rows], engine.slips_from = True, None
+        end_some(rows[ok[rows]], engine.contact_set, True)
         self._hold_up(rows)
         return ok
 
@@ -386,10 +387,9 @@ class TouchingRods(ModalRods):
                 d.point_change,
                 d.point_rotation,
                 acting.points[0].shape[1],
-                self._gone,
                 yielding,
             )
-            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._gone_now))
+            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
             q[left] += step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
@@ -406,7 +406,7 @@ class TouchingRods(ModalRods):
             # at rest what is shown has none of the inertia of the way there
             ends = how if self.dynamics else how._replace(dt=_LONGEST)
             modal.hold(arrived, ports, *found, ends, q, True)
-            end_some(arrived, contacts)
+            end_some(arrived, contacts, engine.slips_from is None)
         failed = rows[~ok[rows]]
         self._through[failed], self._full[failed] = (
             gone[failed],

@@ -24,7 +24,7 @@ from ..jit import inline, kernel
 from ..rod.gather import pick
 from ..vec import Vec, add, axpy, cross, dot, mul, mul_t, scale, sub
 from .bvh import Numbers, Record, normal_of
-from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, rotation_at, tangent_at
+from .centreline import bend_at, curve_of, curve_slip, interval_of, point_at, rotation_at, tangent_at
 from .contact_set import carries, set_normal, wall_at
 from .rod_proximity import partner_of
 from .surface import rotation_of, surface_curvature, to_obstacle
@@ -96,9 +96,6 @@ class Touching(NamedTuple):
     """(n_robots, n_points, 3, n_q) and rotation of the cross-sections there."""
     first: int
     """Number of the first contact among these points."""
-    gone: Floats
-    """(n_robots, n_obstacles, 6) displacement of free bodies, and moment on them, at which a rest was before:
-    what slips against them is counted from there."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
 
@@ -127,7 +124,7 @@ def _place(i: int, s: float, motion: ContactMotion) -> Vec:
 @inline
 def _surface_before(i: int, s: float, arm: Vec, motion: ContactMotion) -> Vec:
     """Place at the step's start of what is now `arm` away from the centreline."""
-    now, before = curve_of(motion, i), curve_before(motion, i)
+    now, before = curve_of(motion, i), curve_slip(motion, i)
     j, fraction = interval_of(now, s, 0)
     rotation = rotation_at(now, j, fraction)
     local = mul_t(rotation, arm)
@@ -378,7 +375,7 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedW
 
 
 @kernel
-def body_of(k: int, surfaces: Surfaces) -> int:
+def _body_of(k: int, surfaces: Surfaces) -> int:
     """Number of the first obstacle of the body that obstacle k is scaled of: the numbers of bodies are the
     user's."""
     first = k
@@ -457,12 +454,9 @@ def gather_world(
             if other >= 0:
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
             elif surfaces.mobility[k, 0] > 0.0:
-                at = n + 6 * body_of(k, surfaces)
+                at = n + 6 * _body_of(k, surfaces)
                 place = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
-                for r in range(1, 3):
-                    for a in range(6):
-                        pressing.free[m, r] -= pressing.along[m, r, at + a] * all_of_it.gone[i, k, a]
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
@@ -480,7 +474,7 @@ def gather_world(
                     pressing.gradient[a] += pressed * pressing.along[m, r, a]
             m += 1
     for k in range(n_obstacles if most > n else 0):
-        mobility, at = surfaces.mobility[k], n + 6 * body_of(k, surfaces)
+        mobility, at = surfaces.mobility[k], n + 6 * _body_of(k, surfaces)
         if mobility[0] > 0.0:
             for a in range(3):
                 pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)
@@ -738,8 +732,8 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
 
 
 @kernel
-def end_contacts(n: int, contacts: Records) -> int:
-    """Keep the contacts that press for the next step, and the force along the surface with which each ends;
+def end_contacts(n: int, contacts: Records, step_ends: bool) -> int:
+    """Keep the contacts that press, and where the step ends the force along the surface with which each does;
     returns how many there are."""
     left = 0
     for c in range(n):
@@ -748,7 +742,8 @@ def end_contacts(n: int, contacts: Records) -> int:
         if not dot(force, force) > 0.0:
             continue
         along = sub(force, scale(dot(force, normal_of(contact)), normal_of(contact)))
-        contact.held[0], contact.held[1], contact.held[2] = along
+        if step_ends:
+            contact.held[0], contact.held[1], contact.held[2] = along
         if left != c:
             contacts[left] = contact
         left += 1
