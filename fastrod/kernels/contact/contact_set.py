@@ -8,18 +8,24 @@ constraint gap(s) >= 0 at every s).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from fastrod.types import Floats, Records, Surfaces
 
 from ..jit import inline, kernel
-from ..vec import Vec, dot
+from ..vec import Vec, dot, mul
 from .bvh import FAR, Numbers, Record, normal_of
-from .surface import ray_hit, signed_distance, walls
+from .surface import ray_hit, rotation_of, signed_distance, to_obstacle, walls
 
 _SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two faces of a corner
 _SAME_GAP = 1e-10  # m; a contact with friction does not move for less
+_ALIKE = 0.5  # cosine of normals that may be of one contact
+_TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
 _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
+
+
+NEW = -1.0  # m: slip of a contact that is not known yet
 
 
 class ContactRules(NamedTuple):
@@ -70,7 +76,8 @@ def open_contact(contact: Record, obstacle: int, s: float, n: Vec, gap: float, r
     set_normal(contact, n)
     contact.shift = FAR
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
-    contact.held[0], contact.held[1], contact.held[2], contact.slid = 0.0, 0.0, 0.0, 0.0
+    contact.held[0], contact.held[1], contact.held[2] = 0.0, 0.0, 0.0
+    contact.slid = NEW
     contact.place[0], contact.place[1], contact.place[2] = FAR, FAR, FAR
     contact.matched = False
 
@@ -102,6 +109,32 @@ def wall_at(
     if best >= 0:
         return found[best].distance, normal_of(found[best])
     return d, n
+
+
+@inline
+def _jumps(n: Vec, old: Vec, moved: Vec, d: float) -> bool:
+    """A normal has turned by more than a place at this distance from an edge turns it as it moves."""
+    turned = math.sqrt(max(2.0 - 2.0 * dot(n, old), 0.0))
+    return turned > _TURNED and turned * max(d, 0.0) > _FASTER * math.sqrt(dot(moved, moved))
+
+
+@kernel
+def measure(
+    contact: Record, frame: Floats, p: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Records
+) -> float:
+    """Gap and normal of a contact whose centreline is at p now, kept in it; returns the distance of p [m], 0
+    where the contact is with another wall than the nearest."""
+    old, last, local = normal_of(contact), contact.place, to_obstacle(frame, p)
+    moved = mul(rotation_of(frame), (local[0] - last[0], local[1] - last[1], local[2] - last[2]))
+    d, n = wall_at(contact.obstacle, frame, p, old, margin, surfaces, stack, found)
+    contact.place[0], contact.place[1], contact.place[2] = local
+    if carries(contact) and _jumps(n, old, moved, d):
+        # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
+        contact.gap += dot(old, moved)
+        return 0.0
+    contact.gap = d - contact.radius
+    set_normal(contact, n)
+    return d
 
 
 @inline
@@ -223,7 +256,7 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
             contact.obstacle == candidate.obstacle
             and not contact.matched
             and away < nearest
-            and dot(normal_of(contact), normal) > 0.5
+            and dot(normal_of(contact), normal) > _ALIKE
             and not _other_wall(contact, candidate.gap, away, rules.tolerance)
         ):
             near, nearest = c, away
@@ -235,7 +268,7 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
-    near = rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
+    near = 0.5 * rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
     if candidate.gap >= contact.gap - near:
         return True
     if rules.still:
@@ -253,12 +286,13 @@ def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: Cont
     """Open a contact for a candidate, unless one with its normal is nearer than `apart`, or there is no room;
     returns how many there are."""
     s, gap, normal = candidate.arclength, candidate.gap, normal_of(candidate)
+    alike = _SAME_WALL if gap < -0.5 * rules.tolerance else _ALIKE
     for c in range(n):
         away = abs(contacts[c].arclength - s)
         if (
             contacts[c].obstacle == candidate.obstacle
             and away < apart
-            and dot(normal_of(contacts[c]), normal) > 0.5
+            and dot(normal_of(contacts[c]), normal) > alike
             and not _other_wall(contacts[c], gap, away, rules.tolerance)
         ):
             return n
@@ -283,7 +317,7 @@ def choose(n_found: int, found: Records, count: int, contacts: Records, rules: C
     for f in range(n_found):
         candidate = found[f]
         k = candidate.obstacle
-        apart = _CLOSE * rules.spacing if candidate.gap < -rules.tolerance else rules.spacing
+        apart = _CLOSE * rules.spacing if candidate.gap < -0.5 * rules.tolerance else rules.spacing
         near = _nearest(candidate, n, contacts, rules)
         if near >= 0:
             contacts[near].matched = True

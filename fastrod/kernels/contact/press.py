@@ -25,9 +25,9 @@ from ..rod.gather import pick
 from ..vec import Vec, add, axpy, cross, dot, mul, mul_t, scale, sub
 from .bvh import Numbers, Record, normal_of
 from .centreline import bend_at, curve_of, curve_slip, interval_of, point_at, rotation_at, tangent_at
-from .contact_set import carries, set_normal, wall_at
+from .contact_set import measure, set_normal
 from .rod_proximity import partner_of
-from .surface import rotation_of, surface_curvature, to_obstacle
+from .surface import surface_curvature
 from .tunnelling import carried
 
 SOFT = 1e-8
@@ -38,7 +38,6 @@ _ROUGHLY = 1e-4  # of the unknowns, where contacts are softer than they are
 _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
-_TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
 _DAMPS, _STIFFENS, _MOST_DAMPED = 0.1, 8.0, 1e6
 """Part of its diagonal that is added to a Hessian with a negative pivot: first, times that, and at most."""
 _AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
@@ -134,34 +133,17 @@ def _surface_before(i: int, s: float, arm: Vec, motion: ContactMotion) -> Vec:
     return add(point_at(before, j, fraction), add(arm, turned))
 
 
-@inline
-def _jumps(n: Vec, old: Vec, moved: Vec, d: float) -> bool:
-    """A normal has turned by more than a place at this distance from an edge turns it as it moves."""
-    turned = math.sqrt(max(2.0 - 2.0 * dot(n, old), 0.0))
-    return turned > _TURNED and turned * max(d, 0.0) > _FASTER * math.sqrt(dot(moved, moved))
-
-
 @kernel
 def _measure_obstacle(
     i: int, contact: Record, all_of_it: Touching, stack: Numbers, wall: Records, curved: Floats
 ) -> Vec:
     """Gap and normal of a contact with an obstacle, kept in it, the second derivative of the gap, and the
-    slip since the step's start (world)."""
+    slip since the last step (world)."""
     motion, surfaces, k = all_of_it.motion, all_of_it.surfaces, contact.obstacle
     p = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
-    margin = motion.margin * all_of_it.rods.length[i]
-    old, last, local = normal_of(contact), contact.place, to_obstacle(frame, p)
-    moved = mul(rotation_of(frame), (local[0] - last[0], local[1] - last[1], local[2] - last[2]))
-    d, n = wall_at(k, frame, p, old, margin, surfaces, stack, wall)
-    first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
-    contact.place[0], contact.place[1], contact.place[2] = local
-    if carries(contact) and _jumps(n, old, moved, d):
-        # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
-        n, contact.gap, d = old, contact.gap + dot(old, moved), 0.0
-    else:
-        contact.gap = d - contact.radius
-    set_normal(contact, n)
+    d = measure(contact, frame, p, motion.margin * all_of_it.rods.length[i], surfaces, stack, wall)
+    n, first, second, e = normal_of(contact), 0.0, 0.0, (0.0, 0.0, 1.0)
     if d > 0.0:
         first, second, e = surface_curvature(k, frame, p, surfaces, stack)
     for a in range(3):
@@ -446,6 +428,8 @@ def gather_world(
             )
             law[0], law[1] = mu if slides else 0.0, SOFT + soft
             law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
+            if law[4] < 0.0:  # of a new contact: as far as its place has come
+                law[4] = math.sqrt(pressing.free[m, 1] ** 2 + pressing.free[m, 2] ** 2)
             _along_axes(axes, pressing.curved[m])
             for r in range(3):
                 for a in range(most):
@@ -719,7 +703,7 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
         y = _requested(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
-        if renew and law[0] * abs(slid - contact.slid) > _RENEWED:
+        if (renew or contact.slid < 0.0) and law[0] * abs(slid - law[4]) > _RENEWED:
             contact.slid, changed = slid, True
         for a in range(3):
             contact.force[a] = force[0] * axes[0, a] + force[1] * axes[1, a] + force[2] * axes[2, a]

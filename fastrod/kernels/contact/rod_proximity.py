@@ -149,6 +149,16 @@ def _add_pair(robot: int, other: int, near: Nearest, gap: float, search: RodSear
 
 
 @kernel
+def _gap_between(robot: int, s: float, other: int, t: float, search: RodSearch) -> float:
+    """Gap between two places of these robots [m]."""
+    a, b = curve_of(search.motion, robot), curve_of(search.motion, other)
+    i, x = interval_of(a, s, 0)
+    j, y = interval_of(b, t, 0)
+    e = sub(point_at(a, i, x), point_at(b, j, y))
+    return math.sqrt(dot(e, e)) - (_radius_at(robot, s, search) + _radius_at(other, t, search))
+
+
+@kernel
 def _hold_nearest(robot: int, other: int, near: Nearest, search: RodSearch, add: bool) -> float:
     """Lower both gaps to this minimum; with `add` a contact of the two moves there, or is opened. Returns the
     violation [m]."""
@@ -158,12 +168,13 @@ def _hold_nearest(robot: int, other: int, near: Nearest, search: RodSearch, add:
     known = _known(robot, other, near, search)
     if known >= 0:
         contact = search.contacts.contact[robot, known]
-        violated = min(0.0, contact.gap) - gap
-        if add and gap < contact.gap - search.closer:
-            contact.arclength = near.s
-            partner = partner_of(search.contacts, search.n_obstacles, robot, known)
-            search.contacts.contact[other, partner].arclength = near.t
-        return float(violated)
+        partner = search.contacts.contact[
+            other, partner_of(search.contacts, search.n_obstacles, robot, known)
+        ]
+        there = _gap_between(robot, contact.arclength, other, partner.arclength, search)
+        if add and gap < there - search.closer:
+            contact.arclength, partner.arclength = near.s, near.t
+        return min(0.0, there) - gap
     if not gap < search.margin * search.rods.length[robot]:
         return 0.0
     if add:
