@@ -38,6 +38,7 @@ from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
+_SWINGS = 6  # steps back in which the steps must have become half as long
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING = 2  # passes after which the slips that a step uses are updated
@@ -345,7 +346,9 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
-        size, over = np.full((2, n), np.inf)  # last step, and what it leaves to be done [rad]
+        # last step, the least one of which half was never missed for long, what the last leaves to be done [rad]
+        size, least, over = np.full((3, n), np.inf)
+        swings, taken = np.zeros(n, np.int64), np.zeros_like(q)
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
@@ -398,7 +401,11 @@ class TouchingRods(ModalRods):
             over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
             self._passes[left] += 1
-            lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
+            swings += (step * taken).sum(1) < 0.0
+            swings[size < np.maximum(0.5 * least, _STILL)] = 0
+            least, taken = np.where(swings == 0, np.minimum(size, least), least), step.copy()
+            lost = ~(size < _FARTHEST) | (swings > _SWINGS)
+            lost = engine.whole_worlds(lost & self._mask(left))
             q[lost] = start[lost]
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):

@@ -38,7 +38,7 @@ _ROUGHLY = 1e-4  # of the unknowns, where contacts are softer than they are
 _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
-_DAMPS, _STIFFENS, _MOST_DAMPED = 0.1, 8.0, 1e6
+_DAMPS, _STIFFENS, _MOST_DAMPED = 0.01, 4.0, 1e6
 """Part of its diagonal that is added to a Hessian with a negative pivot: first, times that, and at most."""
 _AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
 _RENEWED = 5e-6  # m: a slip that changes by less is kept for the next pass
