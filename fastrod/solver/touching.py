@@ -346,7 +346,7 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
-        # last step, the least one of which half was never missed for long, what the last leaves to be done [rad]
+        # last step, the least one that halved in time, and what the last leaves to be done [rad]
         size, least, over = np.full((3, n), np.inf)
         swings, taken = np.zeros(n, np.int64), np.zeros_like(q)
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
