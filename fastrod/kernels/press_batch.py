@@ -80,7 +80,7 @@ def press_some(
     spin: Floats,
     first: int,
     yielding: float,
-    renew: bool,
+    renew: Flags,
     still: bool,
     step: Floats,
     changed: Flags,
@@ -112,7 +112,7 @@ def press_some(
     every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        renewed = press(count, unknowns, contacts, pressing, renew, still)
+        renewed = press(count, unknowns, contacts, pressing, renew[robot[start[k]]], still)
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
             changed[i] = renewed

@@ -41,7 +41,10 @@ _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
 _SWINGS = 6  # steps back in which the steps must have become half as long
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
-_RENEWING = 2  # passes after which the slips that a step uses are updated
+_RENEWING, _NEAR = (
+    2,
+    1e-3,
+)  # rad: slips that a step uses are updated in the first passes; of a rest near its end
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
 _SAME_GAP = 1e-10  # m
@@ -392,7 +395,8 @@ class TouchingRods(ModalRods):
                 acting.points[0].shape[1],
                 yielding,
             )
-            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed))
+            renew = (count < _RENEWING) | (size < (0.0 if self.dynamics else _NEAR))
+            self._press(left, (*seen, *model, renew, still, step, changed))
             q[left] += step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay

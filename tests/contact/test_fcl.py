@@ -26,7 +26,7 @@ SOLIDS: dict[str, Any] = {
 }
 
 
-def pushed(solid: str, collision: Any, n: int = 1, steps: int = 14) -> list[State]:
+def pushed(solid: str, collision: Any, n: int = 1, steps: int = 11) -> list[State]:
     """A prototype that bends while a mesh with friction, and a ball without, are pushed into it."""
     robot = fastrod.load_robot("prototype")
     obstacles = [

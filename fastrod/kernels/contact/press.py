@@ -704,7 +704,8 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
         if (renew or contact.slid < 0.0) and law[0] * abs(slid - law[4]) > _RENEWED:
-            contact.slid, changed = slid, True
+            law[4], changed = slid, True
+        contact.slid = law[4]
         for a in range(3):
             contact.force[a] = force[0] * axes[0, a] + force[1] * axes[1, a] + force[2] * axes[2, a]
         if side[2] >= 0:
