@@ -459,6 +459,14 @@ class Simulator(RobotBatch):
 
         return queries.clearance(self._contact("clearance"), self._full("clearance").as_shape(), obstacle)
 
+    def tendon_bend(self) -> Floats:
+        """(n_robots,) largest curvature of the rod times the offset of a tendon on the inside of the bend.
+        Beyond 0.9 the robot is not to be trusted: where it is 1 a tendon's path has length 0, and a real one
+        lies elsewhere. Raises `InputError` without a state."""
+        from fastrod.solver.recovery import tendon_bend
+
+        return tendon_bend(self._full("tendon_bend").curvature, self._params, self._layout)
+
     def swept_clearance(self, tolerance: float = 1e-5, rows: ArrayLike | None = None) -> Floats:
         """(n_robots,) smallest gap on the straight way from the state before to the last one, to `tolerance`
         [m]; after the first state, its clearance. nan but for `rows`, indices or a mask, where they are

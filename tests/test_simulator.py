@@ -273,3 +273,13 @@ def test_jacobian_that_comes_with_the_step_is_the_same(n_robots, force):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
     derived.settle(**inputs)
     np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("about_d1", "about_d2"), [(0.0, 0.0), (1.0, 0.0), (0.0, -2.0)])
+def test_tendon_bend_is_how_much_shorter_the_inner_path_is(about_d1: float, about_d2: float) -> None:
+    robot = rod()
+    sim = Simulator(robot)
+    with pytest.raises(InputError, match="tendon_bend needs a state"):
+        sim.tendon_bend()
+    state = sim.settle(bend(robot, about_d1, about_d2))  # an arc, along which it is the same everywhere
+    assert_allclose(sim.tendon_bend(), 1.0 - state.path_length.min(1) / robot.length, atol=1e-6)

@@ -25,9 +25,9 @@ from fastrod.kernels.rod.modal.modes import (
     hat_row,
     integral_row,
     interval_of,
-    lagrange_row,
     legendre_at,
     modal_basis,
+    rows_at,
 )
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import ModalOutput, ModalSamples, MotionShape
@@ -80,6 +80,7 @@ def modal_samples(n_segments: int, n_steps: int, per_segment: int, n_degrees: in
     x = s * per_segment - piece
     interval, width = interval_of(x)
     gauss = gauss_points(interval, width)
+    row, lagrange = rows_at(x)
     inside = (piece % per_segment)[:, None] + np.concatenate([gauss, x[:, None]], axis=1)
     return ModalSamples(
         piece=piece,
@@ -88,8 +89,8 @@ def modal_samples(n_segments: int, n_steps: int, per_segment: int, n_degrees: in
         at_gauss=legendre_at(gauss, n_degrees),
         here=legendre_at(x, n_degrees),
         place=inside / per_segment,
-        row=integral_row(x),
-        lagrange=lagrange_row(x),
+        row=row,
+        lagrange=lagrange,
     )
 
 
@@ -472,8 +473,7 @@ class ModalSolver:
         inside = np.minimum(x.astype(np.int64), per - 1)
         self.points = ModalPoints(
             np.ascontiguousarray(segment * per + inside),
-            integral_row(x - inside),
-            lagrange_row(x - inside),
+            *rows_at(x - inside),
             np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
             points[2] if len(points) > 2 else np.zeros((n, m, 3)),
         )

@@ -11,7 +11,7 @@ import numpy as np
 from fastrod.errors import Problem, ProblemSentence
 from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.settle import Pass, load_parameter, settle
-from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 TOLERANCE = 1e-9  # m: that of `Simulator.settle`
 # of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of
@@ -118,6 +118,24 @@ def _largest(a: Floats) -> float:
     if a.size <= 16:
         return float(max(map(abs, a.ravel().tolist()), default=0.0))
     return float(np.abs(a).max())
+
+
+FOLDS = 0.9
+"""Curvature times offset of a tendon, from which on its path on the inside of the bend is hardly longer than
+nothing: where it is 1 the path's length has a kink, and Newton's method swings about it."""
+
+
+def tendon_bend(curvature: Floats, params: Params, layout: Layout) -> Floats:
+    """(n_robots,) largest curvature (n_robots, n_points, 3) [1/m] times the offset of a tendon on the inside:
+    by so much is its path shorter than the rod there. nan without a shape."""
+    most = np.full(len(curvature), -np.inf)
+    for k, first in enumerate(layout.first_tendon):
+        offset = params.offset[:, k, None, first:]
+        last = k + 1 == len(layout.first_tendon)
+        here = curvature[:, k * layout.n_steps : (k + 1) * layout.n_steps + last, None]
+        inside = here[..., 1] * offset[..., 0] - here[..., 0] * offset[..., 1]
+        most = np.maximum(most, inside.max((1, 2), initial=-np.inf))
+    return most
 
 
 def sentence_of(

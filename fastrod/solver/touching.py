@@ -33,6 +33,7 @@ from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
 from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
+from fastrod.solver.recovery import FOLDS, tendon_bend
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
@@ -150,14 +151,21 @@ class TouchingRods(ModalRods):
         self.engine.end_step(ok.astype(float))
         solved = self._solved(found, ok, self._moved_bases(acting.ports, found))
         passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
-        for i in map(int, rows[~ok[rows]]):
+        lost = rows[~ok[rows]]
+        last_shape, folds = self.engine.before, np.zeros(self.n_robots)
+        if len(lost) and last_shape is not None:
+            folds = tendon_bend(last_shape.curvature, self.modal.params, self.modal.layout)
+        for i in map(int, lost):
             k, s = self._nearest.get(i, (-1, 0.0))
             names = self.engine.scene.names
             where = f" with {names[k]!r} at arclength {s:.3g} m" if 0 <= k < len(names) else ""
             inside = f"would be {self._deep[i]:.2g} m inside"
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
-            said, kind = f"{said}; come there in smaller steps.", Problem.CONTACT_STUCK
+            what = "come there in smaller steps"
+            if folds[i] > FOLDS:
+                what = f"it bends by {folds[i]:.2g} of 1 / offset of a tendon, which folds at 1: bend it less"
+            said, kind = f"{said}; {what}.", Problem.CONTACT_STUCK
             if self._through[i]:
                 said = f"contact{where}: the rod would go through it; take smaller steps, or go around it."
                 kind = Problem.CONTACT_TUNNELLED
@@ -246,9 +254,9 @@ class TouchingRods(ModalRods):
 
     def take_over(self, rows: Ints, shape: RodShape, ports: Ports, found: PassShapes) -> None:
         """Let these robots begin from a shape that other means have found on these inputs."""
-        modal = self.modal
-        modal.bend_as(rows, shape, ports)
-        modal.settle(rows, ports, *found, np.inf, self.stepper.time.scheme)
+        if len(rows):
+            self.modal.bend_as(rows, shape, ports)
+            self.modal.settle(rows, ports, *found, np.inf, self.stepper.time.scheme)
 
     @property
     def _is_rigid(self) -> bool:
@@ -355,14 +363,15 @@ class TouchingRods(ModalRods):
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
+        frames = engine.frames(*span)
         for count in range(most + 1):
             worlds = engine.in_worlds(left)
             left = worlds.robot
-            world, near, n_found = self._seen(left, ports, how, q, found, span)
+            world, near, n_found = self._seen(left, ports, how, q, found, frames)
             through = self._mask(left[n_found < 0])
             if count == 0 and through.any():  # at that speed it would go through: from where it is
                 q[through] = start[through]
-                world, near, n_found = self._seen(left, ports, how, q, found, span)
+                world, near, n_found = self._seen(left, ports, how, q, found, frames)
                 through = self._mask(left[n_found < 0])
             search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin, _SAME_GAP)
             violations(worlds, search, engine.surfaces, near, n_found, deep)
@@ -380,7 +389,7 @@ class TouchingRods(ModalRods):
                 self._note_nearest(left, near, n_found)
                 break
             still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
-            renew_some(left, *seen, near, n_found, still)
+            self._renew(left, seen, near, n_found, still)
             if engine.rods_meet:
                 closer = 0.01 * _INSIDE if still else _SAME_GAP
                 search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
@@ -434,6 +443,16 @@ class TouchingRods(ModalRods):
                 least = found[int(np.argmin(found["gap"][: abs(n)]))]
                 self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
+    def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: bool) -> None:
+        """`renew_some` on so many threads."""
+        batches = np.array_split(np.arange(len(rows)), self.engine.thread_count(len(rows)))
+
+        def renew(task: int) -> None:
+            some = batches[task]
+            renew_some(rows[some], *(*seen, near[some], n_found[some], still))
+
+        in_threads(len(batches), renew)
+
     def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""
         start, robot = self.engine.in_worlds(rows)[:2]
@@ -446,13 +465,13 @@ class TouchingRods(ModalRods):
         in_threads(len(batches), press)
 
     def _seen(
-        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[Floats, Floats]
+        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, frames: Any
     ) -> tuple[ContactMotion, Any, Ints]:
-        """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
-        through."""
+        """Rods at q among the obstacles in their `frames`, candidates of these, and how many; below 0 where
+        one was gone through."""
         engine = self.engine
         self.modal.hold(rows, ports, *found, how, q, False)
-        world = engine.motion(found.shape, _INSIDE, *span)
+        world = engine.motion(found.shape, _INSIDE, frames)
         near, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         threads = engine.thread_count(len(rows))
         work = search_work(threads, found.shape.arclength.shape[1])

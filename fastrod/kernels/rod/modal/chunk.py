@@ -34,7 +34,7 @@ from .motion import (
     start_from_rest,
 )
 from .newton import hold, minimise
-from .output import ModalOutput, show_chunk
+from .output import ModalOutput, show_chunk, show_places
 
 
 class ModalRun(NamedTuple):
@@ -143,6 +143,9 @@ def pass_of_modes(
         first = batch.pieces.first_tendon
         if len(run.given) > 0:
             hold(robots, run.given, b, first, command, work, run.ends)
+            if not run.ends:
+                show_places(robots, n_robots, batch, output, work, False)
+                return
         else:
             minimise(b, first, command, work, run.tolerance, least, most, robots, batch.host, motion)
         follow(work)

@@ -70,9 +70,10 @@ def integral_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
     return _times(legendre_at(x, n + 2), _points(n)[2])
 
 
-def lagrange_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
-    """(..., N + 1) Lagrange polynomials of the nodes at x."""
-    return _times(legendre_at(x, n + 1), _points(n)[1])
+def rows_at(x: Floats | float, n: int = N_INTERVALS) -> tuple[Floats, Floats]:
+    """That row, and (..., N + 1) Lagrange polynomials of the nodes at x."""
+    values, (_, lagrange, integral) = legendre_at(x, n + 2), _points(n)
+    return _times(values, integral), _times(values[..., :-1], lagrange)
 
 
 @cache

@@ -9,7 +9,7 @@ from fastrod.types import Floats, Ints, RodShape
 from ...jit import inline, kernel
 from ...vec import Vec, add, axpy, cross, matmul, scale, sub
 from ..gather import pick, scatter
-from ..lanes import Lanes, W, get, get_mat, read
+from ..lanes import Lanes, W, get, get_mat, put, put_mat, read, write
 from .balance import balance_of_piece, pass_on, start_at_tip
 from .fields import (
     B_F,
@@ -78,69 +78,73 @@ class ModalOutput(NamedTuple):
     motion: MotionShape
 
 
-@inline
-def modes_at(p: int, table: Floats, b: ModalBasis, work: ModalWork, w: int) -> tuple[Vec, Vec]:
-    """u - u* and v - e3 where the degrees have these values."""
-    n_modes = b.component.shape[0]
-    u0, u1, u2, v0, v1, v2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for a in range(n_modes):
-        c, value = b.component[a], table[b.degree[a]] * read(work.q, p * n_modes + a, w)
-        u0 += value if c == 0 else 0.0
-        u1 += value if c == 1 else 0.0
-        u2 += value if c == 2 else 0.0
-        v0 += value if c == 3 else 0.0
-        v1 += value if c == 4 else 0.0
-        v2 += value if c == 5 else 0.0
-    return (u0, u1, u2), (v0, v1, v2)
+_FIRST, _SECOND, _BENT, _STRAIN, _PLACE, _ROTATION, _SHOWN = 0, 3, 6, 9, 12, 15, 24
+"""Fields of one cross-section: u at the two Gauss points before it; u - u*, v - e3, position and rotation
+there."""
 
 
 @kernel
-def show_point(
-    m: int, w: int, i: int, samples: ModalSamples, batch: ModalBatch, work: ModalWork, shape: RodShape
-) -> None:
-    """Pose, curvature and total internal moment of cross-section m of lane w, robot i."""
-    p, j, b, ports = samples.piece[m], samples.interval[m], batch.basis, batch.ports
-    piece, node, k = work.piece[p], work.node[p], batch.pieces.segment[p]
-    table = ports.precurvature[pick(i, len(ports.precurvature)), k]
-    stiffness = along(ports.stiffness[pick(i, len(ports.stiffness)), k], samples.place[m, 2])
-    u_star = along(table, samples.place[m, 2])
-    h = samples.width[m] * read(piece, P_L, w)
-    first = add(along(table, samples.place[m, 0]), modes_at(p, samples.at_gauss[m, 0], b, work, w)[0])
-    second = add(along(table, samples.place[m, 1]), modes_at(p, samples.at_gauss[m, 1], b, work, w)[0])
-    o = axpy(MAGNUS * h * h, cross(first, second), scale(0.5 * h, add(first, second)))
-    series, _ = exp_series(o)
-    r = matmul(get_mat(node[j], N_R, w), rotation_of(o, series))
-    place = get(node[0], N_POS, w)
-    for k in range(b.node.shape[0]):
-        place = axpy(samples.row[m, k] * read(piece, P_L, w), get(node[k], N_T, w), place)
-    bent, strain = modes_at(p, samples.here[m], b, work, w)
-    v = (strain[0], strain[1], 1.0 + strain[2])
-    moment = (stiffness[0] * bent[0], stiffness[1] * bent[1], stiffness[2] * bent[2])
-    u = add(u_star, bent)
+def place_section(m: int, robots: Ints, samples: ModalSamples, batch: ModalBatch, work: ModalWork) -> None:
+    """Cross-section m of every lane, into `work.scratch`."""
+    p, j, b, at, ports = samples.piece[m], samples.interval[m], batch.basis, work.scratch, batch.ports
+    n_modes, piece, node, k = b.component.shape[0], work.piece[p], work.node[p], batch.pieces.segment[p]
+    for i in range(_ROTATION * W):
+        at[i] = 0.0
+    for a in range(n_modes):
+        c, degree, q = b.component[a], b.degree[a], work.q[(p * n_modes + a) * W :]
+        here = samples.here[m, degree]
+        for w in range(W):
+            write(at, _BENT + c, w, read(at, _BENT + c, w) + here * q[w])
+        for g in range(2 if c < 3 else 0):
+            field, value = _FIRST + 3 * g + c, samples.at_gauss[m, g, degree]
+            for w in range(W):
+                write(at, field, w, read(at, field, w) + value * q[w])
+    for n in range(b.node.shape[0]):
+        for w in range(W):
+            tangent = axpy(samples.row[m, n], get(node[n], N_T, w), get(at, _PLACE, w))
+            put(at, _PLACE, w, tangent)
+    for w in range(W):
+        i = robots[w]
+        table = ports.precurvature[pick(i, len(ports.precurvature)), k]
+        put(at, _FIRST, w, add(along(table, samples.place[m, 0]), get(at, _FIRST, w)))
+        put(at, _SECOND, w, add(along(table, samples.place[m, 1]), get(at, _SECOND, w)))
+    for w in range(W):
+        length, first, second = read(piece, P_L, w), get(at, _FIRST, w), get(at, _SECOND, w)
+        h = samples.width[m] * length
+        o = axpy(MAGNUS * h * h, cross(first, second), scale(0.5 * h, add(first, second)))
+        series, _ = exp_series(o)
+        put_mat(at, _ROTATION, w, matmul(get_mat(node[j], N_R, w), rotation_of(o, series)))
+        put(at, _PLACE, w, axpy(length, get(at, _PLACE, w), get(node[0], N_POS, w)))
+
+
+@kernel
+def moment_at(
+    m: int, w: int, i: int, u: Vec, samples: ModalSamples, batch: ModalBatch, work: ModalWork
+) -> Vec:
+    """Total internal moment at cross-section m, which bends by u and is in `work.scratch`."""
+    p, ports, at = samples.piece[m], batch.ports, work.scratch
+    table = ports.stiffness[pick(i, len(ports.stiffness)), batch.pieces.segment[p]]
+    k, bent = along(table, samples.place[m, 2]), get(at, _BENT, w)
+    v = add((0.0, 0.0, 1.0), get(at, _STRAIN, w))
+    moment = (k[0] * bent[0], k[1] * bent[1], k[2] * bent[2])
     for t in range(len(work.tension) // W):
         x, y = read(work.offset[p], 2 * t, w), read(work.offset[p], 2 * t + 1, w)
         if x != 0.0 or y != 0.0:
             _, d, _ = path(u, v, x, y)
             moment = axpy(read(work.tension, t, w), (y * d[2], -x * d[2], x * d[1] - y * d[0]), moment)
-    scatter(shape.position[i, m], place)
-    scatter(shape.curvature[i, m], u)
-    scatter(shape.moment[i, m], moment)
-    for a in range(3):
-        scatter(shape.rotation[i, m, a], (r[3 * a], r[3 * a + 1], r[3 * a + 2]))
+    return moment
 
 
 @kernel
-def show_motion(
-    m: int, w: int, i: int, samples: ModalSamples, b: ModalBasis, motion: ModalMotion, work: ModalWork
-) -> tuple[Vec, Vec]:
-    """Velocity, and the strains, of cross-section m."""
+def velocity_at(m: int, i: int, samples: ModalSamples, b: ModalBasis, motion: ModalMotion) -> Vec:
+    """Velocity of cross-section m of robot i."""
     p, n = samples.piece[m], b.node.shape[0]
     velocity = (0.0, 0.0, 0.0)
     for k in range(n):
         at = (p * n + k) * NODE_VECTORS
         here = (motion.velocity[i, at], motion.velocity[i, at + 1], motion.velocity[i, at + 2])
         velocity = axpy(samples.lagrange[m, k], here, velocity)
-    return velocity, modes_at(p, samples.here[m], b, work, w)[1]
+    return velocity
 
 
 @kernel
@@ -221,6 +225,31 @@ def show_tip(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, shape:
 
 
 @kernel
+def show_places(
+    robots: Ints, n_robots: int, batch: ModalBatch, output: ModalOutput, work: ModalWork, whole: bool
+) -> None:
+    """Cross-sections of a chunk: places and curvature; on the `whole` what else is known there."""
+    samples, shape, at, ports = output.samples, output.shape, work.scratch, batch.ports
+    for m in range(len(samples.piece)):
+        place_section(m, robots, samples, batch, work)
+        k = batch.pieces.segment[samples.piece[m]]
+        for w in range(n_robots):
+            i, r = robots[w], get_mat(at, _ROTATION, w)
+            table = ports.precurvature[pick(i, len(ports.precurvature)), k]
+            u = add(along(table, samples.place[m, 2]), get(at, _BENT, w))
+            scatter(shape.position[i, m], get(at, _PLACE, w))
+            scatter(shape.curvature[i, m], u)
+            for a in range(3):
+                scatter(shape.rotation[i, m, a], (r[3 * a], r[3 * a + 1], r[3 * a + 2]))
+            shape.arclength[i, m] = arclength(m, w, samples, batch, work)
+            if whole:
+                scatter(shape.moment[i, m], moment_at(m, w, i, u, samples, batch, work))
+                velocity = velocity_at(m, i, samples, batch.basis, batch.motion)
+                scatter(output.motion.velocity[i, m], velocity)
+                scatter(output.motion.strain[i, m], get(at, _STRAIN, w))
+
+
+@kernel
 def show_chunk(robots: Ints, n_robots: int, batch: ModalBatch, output: ModalOutput, work: ModalWork) -> None:
     """Everything that is wanted of a chunk."""
     b, samples, motion = batch.basis, output.samples, batch.motion
@@ -231,14 +260,7 @@ def show_chunk(robots: Ints, n_robots: int, batch: ModalBatch, output: ModalOutp
         moving.kinetic_energy[i], moving.strain_energy[i] = energies(w, i, b, motion, work)
     if len(shape.position) == 0:
         return
-    for m in range(len(samples.piece)):
-        for w in range(n_robots):
-            i = robots[w]
-            show_point(m, w, i, samples, batch, work, shape)
-            velocity, strain = show_motion(m, w, i, samples, b, motion, work)
-            scatter(moving.velocity[i, m], velocity)
-            scatter(moving.strain[i, m], strain)
-            shape.arclength[i, m] = arclength(m, w, samples, batch, work)
+    show_places(robots, n_robots, batch, output, work, True)
     show_forces(robots, n_robots, samples, b, work, shape)
     if hosted(work):
         show_exchange(robots, n_robots, batch.host, b, motion, work)

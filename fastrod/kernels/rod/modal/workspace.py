@@ -38,7 +38,7 @@ def modal_workspace(n_tasks: int, n_pieces: int, n_tendons: int, n_stations: int
         stiffness=room(n_tendons),
         path_length=room(n_tendons),
         path_change=room(n_tendons * n_q),
-        scratch=room(22),
+        scratch=room(24),
         outside=room(15),
         follow=room(3 * n_q),
         scheme=room(2),
