@@ -282,7 +282,9 @@ class ModalSolver:
     ) -> Flags:
         """Move these robots on by dt; whose Newton's method ended. `jump` (n_robots,): 1 where the inputs
         are not those that the last motion was leading to."""
-        self._run(rows, ports, shape, moving, how, jump, (_NEARLY, how.passes, _MOST), how.scheme)
+        # those side by side that take one step more, for a chunk takes as many as its slowest robot
+        order = rows[np.argsort(-jump[rows], kind="stable")] if jump.any() else rows
+        self._run(order, ports, shape, moving, how, jump, (_NEARLY, how.passes, _MOST), how.scheme)
         return np.asarray(self.iterations[rows] > 0)
 
     def hold(
