@@ -218,7 +218,7 @@ class TouchingRods(ModalRods):
         if engine.before is not None:  # over all the parts of a rest, slip is that of the step
             engine.slips_from = engine.before, engine.poses_before
         ok, done, fraction, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
-        size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
+        size, there, grows = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64), np.full(n, _GROWS)
         for _ in range(_MOST_STEPS if len(left) else 0):
             aim = np.minimum(done + fraction, 1.0)
             follow = there < (_FOLLOWING if tolerance >= AT_REST else _SETTLING)
@@ -241,8 +241,10 @@ class TouchingRods(ModalRods):
                     # a millionth of that is left, and no contact would go elsewhere
                     moved &= (self._late > _LATE) | (self._deep > _SAME_PLACE)
                 ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
-                size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), _FALLS * each)
-                fraction[some] *= np.where(well[some], 4.0, 0.25)
+                grows[some] = np.where(well[some], grows[some], np.maximum(0.25 * grows[some], 2.0))
+                by = np.where(well[some], grows[some], _FALLS)
+                size[some] = np.minimum(by * each, _LONGEST)
+                fraction[some] *= np.sqrt(by)
             left = left[~ok[left] & (size[left] > _GIVEN_UP)]
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
