@@ -181,46 +181,6 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
     return k
 
 
-@kernel
-def _segment_is_full(s: float, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """Whether this segment has as many contacts as it has nodes inside to put them on."""
-    k = segment_at(rules.arclength, rules.n_steps, s)
-    members = 0
-    for c in range(count):
-        members += segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
-    return members >= rules.n_steps - 1
-
-
-@kernel
-def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """An idle contact, open and beside one that presses: it is not wanted next, and its node is better spread
-    out."""
-    if contacts[c].gap < 10.0 * rules.tolerance:
-        return False
-    for e in range(count):
-        if (
-            contacts[e].obstacle == contacts[c].obstacle
-            and abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
-            and carries(contacts[e])
-        ):
-            return True
-    return False
-
-
-@kernel
-def _least_wanted(
-    s: float, gap: float, count: int, contacts: Records, rules: ContactRules, anywhere: bool
-) -> int:
-    """Least wanted of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap,
-    if it is wider than `gap`; -1 if none is."""
-    k, widest, at = segment_at(rules.arclength, rules.n_steps, s), gap, -1
-    for c in range(count):
-        here = anywhere or segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
-        if here and contacts[c].partner < 0 and contacts[c].gap > widest and not carries(contacts[c]):
-            widest, at = contacts[c].gap, c
-    return at
-
-
 @inline
 def _other_wall(contact: Record, gap: float, away: float, tolerance: float) -> bool:
     """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one
@@ -231,12 +191,11 @@ def _other_wall(contact: Record, gap: float, away: float, tolerance: float) -> b
 @kernel
 def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
     """Drop the contacts that neither press nor may be wanted next; returns how many are left."""
-    n = 0
-    room = count <= len(contacts) - 4
+    n, room = 0, count <= len(contacts) - 4
     for c in range(count):
         contact = contacts[c]
         idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
-        if rules.still or carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
+        if rules.still or carries(contact) or (idle and room):
             if n != c:
                 contacts[n] = contacts[c]
             contacts[n].matched = False
@@ -296,10 +255,11 @@ def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: Cont
             and not _other_wall(contacts[c], gap, away, rules.tolerance)
         ):
             return n
-    at, segment_full = n, _segment_is_full(s, n, contacts, rules)
-    if (n >= len(contacts) or segment_full) and gap < -rules.tolerance:
-        at = _least_wanted(s, gap, n, contacts, rules, not segment_full)
-    if not 0 <= at < len(contacts):
+    at, widest = n, gap
+    for c in range(n if n == len(contacts) and gap < -rules.tolerance else 0):  # in place of an idle one
+        if contacts[c].partner < 0 and contacts[c].gap > widest and not carries(contacts[c]):
+            at, widest = c, contacts[c].gap
+    if at == len(contacts):
         return n
     radius = rules.radius[segment_at(rules.arclength, rules.n_steps, s)]
     open_contact(contacts[at], candidate.obstacle, s, normal, gap, radius)
