@@ -19,7 +19,7 @@ from .bvh import FAR, Numbers, Record, normal_of
 from .surface import ray_hit, rotation_of, signed_distance, to_obstacle, walls
 
 _SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two faces of a corner
-_SAME_GAP = 1e-10  # m; a contact with friction does not move for less
+_SAME_GAP = 1e-9  # m; a contact does not move for less
 _ALIKE = 0.5  # cosine of normals that may be of one contact
 _TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
 _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
@@ -181,6 +181,18 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
     return k
 
 
+@kernel
+def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
+    """An idle contact, open and beside one that presses: it is not wanted next."""
+    if contacts[c].gap < 10.0 * rules.tolerance:
+        return False
+    for e in range(count):
+        beside = abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
+        if beside and contacts[e].obstacle == contacts[c].obstacle and carries(contacts[e]):
+            return True
+    return False
+
+
 @inline
 def _other_wall(contact: Record, gap: float, away: float, tolerance: float) -> bool:
     """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one
@@ -195,7 +207,7 @@ def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
     for c in range(count):
         contact = contacts[c]
         idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
-        if rules.still or carries(contact) or (idle and room):
+        if rules.still or carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
             if n != c:
                 contacts[n] = contacts[c]
             contacts[n].matched = False
@@ -227,7 +239,7 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
-    near = 0.5 * rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
+    near = 0.5 * rules.tolerance if rules.still else _SAME_GAP
     if candidate.gap >= contact.gap - near:
         return True
     if rules.still:
