@@ -80,7 +80,7 @@ def press_some(
     spin: Floats,
     first: int,
     yielding: float,
-    renew: Flags,
+    renew: Floats,
     still: bool,
     step: Floats,
     changed: Flags,

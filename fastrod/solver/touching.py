@@ -19,6 +19,7 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem, ProblemSentence
 from fastrod.kernels.contact.candidates import MOST_FOUND
+from fastrod.kernels.contact.press import RENEWED, SOFT
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
@@ -39,13 +40,11 @@ from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
-_SWINGS = 6  # steps back in which the steps must have become half as long
+_SWINGS = 12  # steps back in which the steps must have become half as long
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
-_RENEWING, _NEAR = (
-    2,
-    1e-3,
-)  # rad: slips that a step uses are updated in the first passes; of a rest near its end
+# slips that a step uses are updated in so many passes, and in a rest after such a step [rad], to this [m]
+_RENEWING, _NEAR, _EXACTLY = 2, 1e-3, 5e-8
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
 _SAME_GAP = 1e-10  # m
@@ -157,7 +156,9 @@ class TouchingRods(ModalRods):
             folds = tendon_bend(last_shape.curvature, self.modal.params, self.modal.layout)
         for i in map(int, lost):
             k, s = self._nearest.get(i, (-1, 0.0))
-            names = self.engine.scene.names
+            names, contacts = self.engine.scene.names, self.engine.contact_set
+            if k < 0 and contacts.used[i]:
+                k, s = contacts.contact[i, 0][["obstacle", "arclength"]]
             where = f" with {names[k]!r} at arclength {s:.3g} m" if 0 <= k < len(names) else ""
             inside = f"would be {self._deep[i]:.2g} m inside"
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
@@ -239,7 +240,8 @@ class TouchingRods(ModalRods):
                 moved = np.abs(modal.motion.place - was).max(1) >= max(tolerance, _CREEPS)
                 if tolerance >= AT_REST and not self.dynamics:
                     # a millionth of that is left, and no contact would go elsewhere
-                    moved &= (self._late > _LATE) | (self._deep > _SAME_PLACE)
+                    elsewhere = self._deep > _SAME_PLACE + self._depth()
+                    moved = (moved & (self._late > _LATE)) | (elsewhere & (moved | follow))
                 ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
                 grows[some] = np.where(well[some], grows[some], np.maximum(0.25 * grows[some], 2.0))
                 by = np.where(well[some], grows[some], _FALLS)
@@ -265,6 +267,13 @@ class TouchingRods(ModalRods):
         """Whether nothing that the rods touch gives way."""
         surfaces, rods = self.engine.surfaces, self.engine.rods
         return not (surfaces.compliance.any() or surfaces.mobility[:, 0].any() or rods.compliance > 0.0)
+
+    def _depth(self) -> Floats:
+        """(n_robots,) by how much what is rigid gives way under the forces of the contacts [m]."""
+        contacts = self.engine.contact_set
+        force = np.linalg.norm(contacts.contact["force"], axis=2)
+        there = np.arange(force.shape[1]) < contacts.used[:, None]
+        return np.asarray(SOFT * force.max(1, where=there, initial=0.0))
 
     def _hold_up(self, rows: Ints) -> None:
         """Take the motion of these robots from them."""
@@ -406,7 +415,8 @@ class TouchingRods(ModalRods):
                 acting.points[0].shape[1],
                 yielding,
             )
-            renew = (count < _RENEWING) | (size < (0.0 if self.dynamics else _NEAR))
+            renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
+            renew[size < (0.0 if self.dynamics else _NEAR)] = _EXACTLY
             self._press(left, (*seen, *model, renew, still, step, changed))
             q[left] += step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
@@ -422,6 +432,7 @@ class TouchingRods(ModalRods):
             lost = ~(size < _FARTHEST) | (swings > _SWINGS)
             lost = engine.whole_worlds(lost & self._mask(left))
             q[lost] = start[lost]
+            self._note_nearest(left[lost[left]], near[lost[left]], n_found[lost[left]])
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):
             modal.place_points(self._points(arrived, acting), ports.extension)

@@ -238,7 +238,6 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
 def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
-    rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
     near = 0.5 * rules.tolerance if rules.still else _SAME_GAP
     if candidate.gap >= contact.gap - near:
         return True
@@ -246,7 +245,7 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
         return False
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
-    if settles or not carries(contact) or rubs:
+    if settles or not carries(contact):
         contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
         return True
     return False

@@ -41,7 +41,7 @@ _PIVOT = 1e-12  # of a diagonal entry
 _DAMPS, _STIFFENS, _MOST_DAMPED = 0.01, 4.0, 1e6
 """Part of its diagonal that is added to a Hessian with a negative pivot: first, times that, and at most."""
 _AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
-_RENEWED = 5e-6  # m: a slip that changes by less is kept for the next pass
+RENEWED = 5e-6  # m: friction times a slip that changes by less is kept for the next pass
 
 
 class PressedWorld(NamedTuple):
@@ -670,10 +670,11 @@ def _minimise(
 
 
 @kernel
-def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool, still: bool) -> bool:
+def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: float, still: bool) -> bool:
     """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
-    changed, where it may (`renew`). `still`: contacts stay where they are. Where Newton's method takes long
-    (many contacts slip, in directions that they have yet to find), contacts are soft first."""
+    changed, by more than `renew` [m] times its friction. `still`: contacts stay where they are. Where
+    Newton's method takes long (many contacts slip, in directions that they have yet to find), contacts are
+    soft first."""
     for a in range(n):
         pressing.step[a] = 0.0
     if not still:
@@ -694,7 +695,7 @@ def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: b
 
 
 @kernel
-def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
+def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: float) -> bool:
     """Forces and slips after the step, to both sides of a contact; whether a slip has changed."""
     changed = False
     for k in range(m):
@@ -703,7 +704,8 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
         y = _requested(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
-        if (renew or contact.slid < 0.0) and law[0] * abs(slid - law[4]) > _RENEWED:
+        least = renew if contact.slid >= 0.0 else min(renew, RENEWED)
+        if law[0] * abs(slid - law[4]) > least:
             law[4], changed = slid, True
         contact.slid = law[4]
         for a in range(3):
