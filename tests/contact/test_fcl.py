@@ -27,11 +27,12 @@ SOLIDS: dict[str, Any] = {
 
 
 def pushed(solid: str, collision: Any, n: int = 1, steps: int = 14) -> list[State]:
-    """A prototype that bends while a mesh with friction, and a ball without, are pushed into it."""
+    """A prototype that a mesh with friction bends over a ball near its tip: what is pressed between two bodies at
+    one place, with friction, takes any force that locks, and has no load to compare."""
     robot = fastrod.load_robot("prototype")
     obstacles = [
         mesh(SOLIDS[solid](), name=solid, friction=0.3),
-        sphere(0.02, name="round", position=(-0.036, 0.0, 0.05)),
+        sphere(0.02, name="round", position=(-0.036, 0.0, 0.068)),
     ]
     scene = ContactScene(obstacles=obstacles, collision=collision)
     sim = fastrod.Simulator(robot, n, points_per_segment=10, contact=scene)
