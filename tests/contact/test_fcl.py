@@ -27,8 +27,8 @@ SOLIDS: dict[str, Any] = {
 
 
 def pushed(solid: str, collision: Any, n: int = 1, steps: int = 14) -> list[State]:
-    """A prototype that a mesh with friction bends over a ball near its tip: what is pressed between two bodies at
-    one place, with friction, takes any force that locks, and has no load to compare."""
+    """A prototype that a mesh with friction bends over a ball near its tip: pressed between the two at one
+    place it takes any force that locks, and there is no load to compare."""
     robot = fastrod.load_robot("prototype")
     obstacles = [
         mesh(SOLIDS[solid](), name=solid, friction=0.3),
