@@ -262,8 +262,12 @@ class ContactMotion(NamedTuple):
     rotation_before: Floats
     curvature_before: Floats
     arclength_before: Floats
-    """Cross-sections from which the rods have come, having met nothing since, and what slip is counted
-    from."""
+    """Cross-sections from which the rods have come, having met nothing since."""
+    position_slip: Floats
+    rotation_slip: Floats
+    curvature_slip: Floats
+    arclength_slip: Floats
+    """The shapes at the last step: what slip is counted from."""
     distance: Floats
     measured_at: Floats
     gap: Floats

@@ -68,6 +68,8 @@ class Engine:
         self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
+        self.slips_from: tuple[RodShape, Floats] | None = None
+        """Shape and obstacles from which slip is counted, where that is not from `before`."""
         self._broad: BroadPhase | None = None  # of scenes by FCL
 
     def __getstate__(self) -> dict[str, Any]:
@@ -164,7 +166,7 @@ class Engine:
         threads = self.thread_count(len(rows))
         found, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         one = np.ones(1)
-        motion = self.motion(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
+        motion = self.motion(shape, 1e-9, self.frames(0.0 * one, one))._replace(margin=0.0)
         work = search_work(threads, shape.arclength.shape[1])
         near = rows if self.scene.collision == "bvh" else self._near(rows, shape)
         if len(near):
@@ -233,23 +235,30 @@ class Engine:
         """Threads for n robots, or worlds."""
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def motion(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> ContactMotion:
-        """Rods in `shape` and the obstacles at the fraction `aim` of their displacement, where the fraction
-        `done` is behind."""
-        if self.poses is self.poses_before and not self.velocities:
-            frames = before = slip = frames_of(self.poses)
-        else:
-            poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
-            ago = last.repeat(max(len(poses), 1) // max(len(last), 1), axis=0) if self.velocities else last
-            for k, velocity in self.velocities.items():
-                slid = back_by(poses[:, k], velocity, self.dt * (aim - done))
-                ago = ago.repeat(len(slid) // len(ago), axis=0)
-                ago[:, k] = slid
-            frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
+    def frames(self, done: Floats, aim: Floats) -> tuple[Floats, Floats, Floats]:
+        """Frames of the obstacles at the fraction `aim` of their displacement, at `done`, which is behind,
+        and where slip is counted from."""
+        began = None if self.slips_from is None else self.slips_from[1]
+        if self.poses is self.poses_before and not self.velocities and began is None:
+            still = frames_of(self.poses)
+            return still, still, still
+        poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
+        ago = last if began is None else began
+        ago = ago.repeat(max(len(poses), 1) // max(len(ago), 1), axis=0) if self.velocities else ago
+        for k, velocity in self.velocities.items():
+            slid = back_by(poses[:, k], velocity, self.dt * (aim - done if began is None else aim))
+            ago = ago.repeat(len(slid) // len(ago), axis=0)
+            ago[:, k] = slid
+        return frames_of(poses), frames_of(last), frames_of(ago)
+
+    def motion(
+        self, shape: RodShape, tolerance: float, frames: tuple[Floats, Floats, Floats]
+    ) -> ContactMotion:
+        """Rods in `shape` among the obstacles in their `frames`."""
+        came = shape if self.before is None else self.before
         return motion_of(
-            (frames, before, slip),
-            shape,
-            shape if self.before is None else self.before,
+            frames,
+            (shape, came, came if self.slips_from is None else self.slips_from[0]),
             self.clearance,
             tracked=self.tracked,
             slides=self.tracked & self.slides,
@@ -268,8 +277,7 @@ def starts_of(world: Ints) -> Ints:
 
 def motion_of(
     frames: tuple[Floats, Floats, Floats],
-    shape: RodShape,
-    before: RodShape,
+    shapes: tuple[RodShape, RodShape, RodShape],
     clearance: Clearance,
     *,
     tracked: Flags,
@@ -277,10 +285,9 @@ def motion_of(
     tolerance: float,
     margin: float,
 ) -> ContactMotion:
-    """Put together what kernels read of one pass: `frames` now, before, and for slip."""
-    return ContactMotion(
-        *frames, *_curves(shape), *_curves(before), *clearance, tracked, slides, tolerance, margin
-    )
+    """Put together what kernels read of one pass: `frames` and `shapes` now, before, and for slip."""
+    now, came, origin = (_curves(shape) for shape in shapes)
+    return ContactMotion(*frames, *now, *came, *origin, *clearance, tracked, slides, tolerance, margin)
 
 
 def _curves(shape: RodShape) -> tuple[Floats, Floats, Floats, Floats]:

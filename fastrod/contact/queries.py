@@ -58,8 +58,7 @@ def _gap(
     known = unknown_clearance(n, n_points)
     motion = motion_of(
         (frames, frames, frames),
-        shape,
-        shape,
+        (shape, shape, shape),
         known,
         tracked=nobody,
         slides=nobody,

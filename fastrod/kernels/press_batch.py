@@ -20,7 +20,7 @@ from fastrod.types import (
 from .contact.bvh import STACK
 from .contact.candidates import renew_contacts
 from .contact.contact_set import violation
-from .contact.press import PressedWorld, Touching, body_of, end_contacts, gather_world, press
+from .contact.press import PressedWorld, Touching, end_contacts, gather_world, press
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
 from .jit import entry
@@ -79,16 +79,13 @@ def press_some(
     change: Floats,
     spin: Floats,
     first: int,
-    gone: Floats,
     yielding: float,
-    renew: bool,
+    renew: Floats,
     still: bool,
     step: Floats,
     changed: Flags,
-    gone_now: Floats,
 ) -> None:
-    """Step (n_robots, n_q) and forces of these worlds (`press`), whose slips were renewed, and the `gone_now`
-    (n_robots, n_obstacles, 6) that free bodies go, as `Touching.gone`."""
+    """Step (n_robots, n_q) and forces of these worlds (`press`), and whose slips were renewed."""
     n_q, most, n_rows = gradient.shape[1], contacts.contact.shape[1], 0
     for k in range(len(start) - 1):
         n_rows = max(n_rows, start[k + 1] - start[k])
@@ -112,25 +109,20 @@ def press_some(
         np.empty((2, n)),
     )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
-    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, gone, yielding)
+    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        renewed = press(count, unknowns, contacts, pressing, renew, still)
+        renewed = press(count, unknowns, contacts, pressing, renew[robot[start[k]]], still)
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
             changed[i] = renewed
             for a in range(n_q):
                 step[i, a] = pressing.step[o * n_q + a]
-            for b in range(len(surfaces.primitive) if surfaces.mobility[:, 0].any() else 0):
-                for a in range(6):
-                    gone_now[i, b, a] = pressing.step[
-                        (start[k + 1] - start[k]) * n_q + 6 * body_of(b, surfaces) + a
-                    ]
 
 
 @entry
-def end_some(rows: Ints, contacts: ContactSet) -> None:
-    """The contacts of these robots at the end of a step (`end_contacts`)."""
+def end_some(rows: Ints, contacts: ContactSet, step_ends: bool) -> None:
+    """The contacts of these robots at the end of a step, or of a part of one (`end_contacts`)."""
     for r in range(len(rows)):
         i = rows[r]
-        contacts.used[i] = end_contacts(contacts.used[i], contacts.contact[i])
+        contacts.used[i] = end_contacts(contacts.used[i], contacts.contact[i], step_ends)

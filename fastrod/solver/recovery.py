@@ -120,6 +120,11 @@ def _largest(a: Floats) -> float:
     return float(np.abs(a).max())
 
 
+FOLDS = 0.9
+"""Curvature times offset of a tendon, from which on its path on the inside of the bend is hardly longer than
+nothing: where it is 1 the path's length has a kink, and Newton's method swings about it."""
+
+
 def tendon_bend(curvature: Floats, params: Params, layout: Layout) -> Floats:
     """(n_robots,) largest curvature (n_robots, n_points, 3) [1/m] times the offset of a tendon on the inside:
     by so much is its path shorter than the rod there. nan without a shape."""

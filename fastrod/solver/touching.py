@@ -19,6 +19,7 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem, ProblemSentence
 from fastrod.kernels.contact.candidates import MOST_FOUND
+from fastrod.kernels.contact.press import RENEWED
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
@@ -33,14 +34,17 @@ from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
 from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
+from fastrod.solver.recovery import FOLDS, tendon_bend
 from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
+_SWINGS = 12  # steps back in which the steps must have become half as long
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
-_RENEWING = 2  # passes after which the slips that a step uses are updated
+# slips that a step uses are updated in so many passes, and in a rest after such a step [rad], to this [m]
+_RENEWING, _NEAR, _EXACTLY = 2, 1e-3, 5e-8
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
 _SAME_GAP = 1e-10  # m
@@ -77,8 +81,6 @@ class TouchingRods(ModalRods):
         # contacts were as many as there may be
         self._blocked, self._through, self._full = np.zeros((3, self.n_robots), bool)
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
-        # of free bodies: in a step, and in a rest until then (`Touching.gone`)
-        self._gone_now, self._gone = np.zeros((2, self.n_robots, len(engine.scene.names), 6))
         self._late = np.zeros(self.n_robots)  # largest step since contacts stayed where they were [rad]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
 
@@ -148,14 +150,23 @@ class TouchingRods(ModalRods):
         self.engine.end_step(ok.astype(float))
         solved = self._solved(found, ok, self._moved_bases(acting.ports, found))
         passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
-        for i in map(int, rows[~ok[rows]]):
+        lost = rows[~ok[rows]]
+        last_shape, folds = self.engine.before, np.zeros(self.n_robots)
+        if len(lost) and last_shape is not None:
+            folds = tendon_bend(last_shape.curvature, self.modal.params, self.modal.layout)
+        for i in map(int, lost):
             k, s = self._nearest.get(i, (-1, 0.0))
-            names = self.engine.scene.names
+            names, contacts = self.engine.scene.names, self.engine.contact_set
+            if k < 0 and contacts.used[i]:
+                k, s = contacts.contact[i, 0][["obstacle", "arclength"]]
             where = f" with {names[k]!r} at arclength {s:.3g} m" if 0 <= k < len(names) else ""
             inside = f"would be {self._deep[i]:.2g} m inside"
             what = inside if self._deep[i] > _INSIDE else "finds no balance"
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
-            said, kind = f"{said}; come there in smaller steps.", Problem.CONTACT_STUCK
+            what = "come there in smaller steps"
+            if folds[i] > FOLDS:
+                what = f"it bends to {folds[i]:.2g} / (offset of a tendon), which folds at 1: bend it less"
+            said, kind = f"{said}; {what}.", Problem.CONTACT_STUCK
             if self._through[i]:
                 said = f"contact{where}: the rod would go through it; take smaller steps, or go around it."
                 kind = Problem.CONTACT_TUNNELLED
@@ -205,8 +216,10 @@ class TouchingRods(ModalRods):
             engine.accept(np.flatnonzero(clear), found.shape, between_steps=True)
             self._blocked[fresh[~clear[fresh]]] = True
         engine.slides[rows] = ~cold[rows]  # who comes from nowhere has not slipped
+        if engine.before is not None:  # over all the parts of a rest, slip is that of the step
+            engine.slips_from = engine.before, engine.poses_before
         ok, done, fraction, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
-        size, there = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64)
+        size, there, grows = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64), np.full(n, _GROWS)
         for _ in range(_MOST_STEPS if len(left) else 0):
             aim = np.minimum(done + fraction, 1.0)
             follow = there < (_FOLLOWING if tolerance >= AT_REST else _SETTLING)
@@ -219,7 +232,7 @@ class TouchingRods(ModalRods):
                 was, how = modal.motion.place.copy(), Step(BDF1, float(each))
                 well = self._one(some, acting, inputs, how, (done.copy(), aim), found, follows)
                 engine.accept(np.flatnonzero(well), found.shape, between_steps=True)
-                done[well], self._gone[well] = aim[well], self._gone_now[well]
+                done[well] = aim[well]
                 arrived = well & (done >= 1.0)
                 there += arrived
                 engine.place_at_once(arrived)
@@ -229,21 +242,24 @@ class TouchingRods(ModalRods):
                     # a millionth of that is left, and no contact would go elsewhere
                     moved &= (self._late > _LATE) | (self._deep > _SAME_PLACE)
                 ok[some] = (arrived & ~engine.whole_worlds(moved))[some] & (each >= _RESTS)
-                size[some] = np.where(well[some], min(_GROWS * each, _LONGEST), _FALLS * each)
-                fraction[some] *= np.where(well[some], 4.0, 0.25)
+                grows[some] = np.where(well[some], grows[some], np.maximum(0.25 * grows[some], 2.0))
+                by = np.where(well[some], grows[some], _FALLS)
+                size[some] = np.minimum(by * each, _LONGEST)
+                fraction[some] *= np.sqrt(by)
             left = left[~ok[left] & (size[left] > _GIVEN_UP)]
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
                 break
-        engine.slides[rows], self._gone[rows] = True, 0.0
+        engine.slides[rows], engine.slips_from = True, None
+        end_some(rows[ok[rows]], engine.contact_set, True)
         self._hold_up(rows)
         return ok
 
     def take_over(self, rows: Ints, shape: RodShape, ports: Ports, found: PassShapes) -> None:
         """Let these robots begin from a shape that other means have found on these inputs."""
-        modal = self.modal
-        modal.bend_as(rows, shape, ports)
-        modal.settle(rows, ports, *found, np.inf, self.stepper.time.scheme)
+        if len(rows):
+            self.modal.bend_as(rows, shape, ports)
+            self.modal.settle(rows, ports, *found, np.inf, self.stepper.time.scheme)
 
     @property
     def _is_rigid(self) -> bool:
@@ -344,18 +360,21 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
         most = _PASSES if self.dynamics else _TO_REST
-        size, over = np.full((2, n), np.inf)  # last step, and what it leaves to be done [rad]
+        # last step, the least one that halved in time, and what the last leaves to be done [rad]
+        size, least, over = np.full((3, n), np.inf)
+        swings, taken = np.zeros(n, np.int64), np.zeros_like(q)
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
+        frames = engine.frames(*span)
         for count in range(most + 1):
             worlds = engine.in_worlds(left)
             left = worlds.robot
-            world, near, n_found = self._seen(left, ports, how, q, found, span)
+            world, near, n_found = self._seen(left, ports, how, q, found, frames)
             through = self._mask(left[n_found < 0])
             if count == 0 and through.any():  # at that speed it would go through: from where it is
                 q[through] = start[through]
-                world, near, n_found = self._seen(left, ports, how, q, found, span)
+                world, near, n_found = self._seen(left, ports, how, q, found, frames)
                 through = self._mask(left[n_found < 0])
             search = RodSearch(world, engine.rods, contacts, world.frames.shape[1], world.margin, _SAME_GAP)
             violations(worlds, search, engine.surfaces, near, n_found, deep)
@@ -373,7 +392,7 @@ class TouchingRods(ModalRods):
                 self._note_nearest(left, near, n_found)
                 break
             still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
-            renew_some(left, *seen, near, n_found, still)
+            self._renew(left, seen, near, n_found, still)
             if engine.rods_meet:
                 closer = 0.01 * _INSIDE if still else _SAME_GAP
                 search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
@@ -386,10 +405,11 @@ class TouchingRods(ModalRods):
                 d.point_change,
                 d.point_rotation,
                 acting.points[0].shape[1],
-                self._gone,
                 yielding,
             )
-            self._press(left, (*seen, *model, count < _RENEWING, still, step, changed, self._gone_now))
+            renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
+            renew[size < (0.0 if self.dynamics else _NEAR)] = _EXACTLY
+            self._press(left, (*seen, *model, renew, still, step, changed))
             q[left] += step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
@@ -398,15 +418,20 @@ class TouchingRods(ModalRods):
             over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
             self._passes[left] += 1
-            lost = engine.whole_worlds(np.asarray(~(size < _FARTHEST)) & self._mask(left))
+            swings += (step * taken).sum(1) < 0.0
+            swings[size < np.maximum(0.5 * least, _STILL)] = 0
+            least, taken = np.where(swings == 0, np.minimum(size, least), least), step.copy()
+            lost = ~(size < _FARTHEST) | (swings > _SWINGS)
+            lost = engine.whole_worlds(lost & self._mask(left))
             q[lost] = start[lost]
+            self._note_nearest(left[lost[left]], near[lost[left]], n_found[lost[left]])
             left = left[~lost[left]]
         if len(arrived := np.flatnonzero(ok)):
             modal.place_points(self._points(arrived, acting), ports.extension)
             # at rest what is shown has none of the inertia of the way there
             ends = how if self.dynamics else how._replace(dt=_LONGEST)
             modal.hold(arrived, ports, *found, ends, q, True)
-            end_some(arrived, contacts)
+            end_some(arrived, contacts, engine.slips_from is None)
         failed = rows[~ok[rows]]
         self._through[failed], self._full[failed] = (
             gone[failed],
@@ -423,6 +448,16 @@ class TouchingRods(ModalRods):
                 least = found[int(np.argmin(found["gap"][: abs(n)]))]
                 self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
+    def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: bool) -> None:
+        """`renew_some` on so many threads."""
+        batches = np.array_split(np.arange(len(rows)), self.engine.thread_count(len(rows)))
+
+        def renew(task: int) -> None:
+            some = batches[task]
+            renew_some(rows[some], *(*seen, near[some], n_found[some], still))
+
+        in_threads(len(batches), renew)
+
     def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""
         start, robot = self.engine.in_worlds(rows)[:2]
@@ -435,13 +470,13 @@ class TouchingRods(ModalRods):
         in_threads(len(batches), press)
 
     def _seen(
-        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, span: tuple[Floats, Floats]
+        self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, frames: Any
     ) -> tuple[ContactMotion, Any, Ints]:
-        """Rods at q among the obstacles, candidates of these, and how many; below 0 where one was gone
-        through."""
+        """Rods at q among the obstacles in their `frames`, candidates of these, and how many; below 0 where
+        one was gone through."""
         engine = self.engine
         self.modal.hold(rows, ports, *found, how, q, False)
-        world = engine.motion(found.shape, _INSIDE, *span)
+        world = engine.motion(found.shape, _INSIDE, frames)
         near, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         threads = engine.thread_count(len(rows))
         work = search_work(threads, found.shape.arclength.shape[1])

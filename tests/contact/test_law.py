@@ -13,7 +13,7 @@ from fastrod.types import CONTACT, ContactSet
 
 @njit()
 def _press(m, n, contacts, pressing):
-    return press(m, n, contacts, pressing, False, True)
+    return press(m, n, contacts, pressing, np.inf, True)
 
 
 def world(rng, m, n, mu):

@@ -8,7 +8,7 @@ from ..jit import inline, kernel, take_next
 from ..rod.gather import pick
 from .bvh import Numbers
 from .centreline import curve_of, interval_of, point_at
-from .contact_set import ContactRules, add_walls, choose, merge
+from .contact_set import ContactRules, add_walls, choose, measure, merge
 from .proximity import ProximityOptions, ProximitySearch, search_obstacles, task_search_work
 from .tunnelling import face_entered_sides, moved_far, tunnelled
 
@@ -93,6 +93,11 @@ def renew_contacts(
     centre, wall = room
     margin = motion.margin * rods.length[i]
     face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)
+    for c in range(contacts.used[i]):
+        k = contact[c].obstacle
+        if k < len(frames) and surfaces.friction[k] > 0.0:
+            j, fraction = interval_of(curve, contact[c].arclength, 0)
+            measure(contact[c], frames[k], point_at(curve, j, fraction), margin, surfaces, stack, wall)
     rules = ContactRules(
         surfaces,
         len(frames),

@@ -42,6 +42,14 @@ def curve_before(motion: ContactMotion, i: int) -> Curve:
 
 
 @inline
+def curve_slip(motion: ContactMotion, i: int) -> Curve:
+    """Robot i at the last step."""
+    return Curve(
+        motion.position_slip[i], motion.rotation_slip[i], motion.curvature_slip[i], motion.arclength_slip[i]
+    )
+
+
+@inline
 def _weights(fraction: float, h: float) -> tuple[float, float, float, float]:
     """Return the weights of the value at the start, the slope there, the value at the end and the slope
     there."""

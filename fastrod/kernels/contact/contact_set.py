@@ -8,18 +8,26 @@ constraint gap(s) >= 0 at every s).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from fastrod.types import Floats, Records, Surfaces
 
 from ..jit import inline, kernel
-from ..vec import Vec, dot
+from ..vec import Vec, dot, mul
 from .bvh import FAR, Numbers, Record, normal_of
-from .surface import ray_hit, signed_distance, walls
+from .surface import ray_hit, rotation_of, signed_distance, to_obstacle, walls
 
 _SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two faces of a corner
-_SAME_GAP = 1e-10  # m; a contact with friction does not move for less
-_CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
+_SAME_GAP = 1e-9  # m; a contact does not move for less
+_ALIKE = 0.5  # cosine of normals that may be of one contact
+_TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
+# of a step: the least that two contacts of one obstacle are apart; and with friction, which would share the load
+# of one place with as much right
+_CLOSE, _BESIDE = 1e-3, 1e-2
+
+
+NEW = -1.0  # m: slip of a contact that is not known yet
 
 
 class ContactRules(NamedTuple):
@@ -70,7 +78,8 @@ def open_contact(contact: Record, obstacle: int, s: float, n: Vec, gap: float, r
     set_normal(contact, n)
     contact.shift = FAR
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
-    contact.held[0], contact.held[1], contact.held[2], contact.slid = 0.0, 0.0, 0.0, 0.0
+    contact.held[0], contact.held[1], contact.held[2] = 0.0, 0.0, 0.0
+    contact.slid = NEW
     contact.place[0], contact.place[1], contact.place[2] = FAR, FAR, FAR
     contact.matched = False
 
@@ -102,6 +111,32 @@ def wall_at(
     if best >= 0:
         return found[best].distance, normal_of(found[best])
     return d, n
+
+
+@inline
+def _jumps(n: Vec, old: Vec, moved: Vec, d: float) -> bool:
+    """A normal has turned by more than a place at this distance from an edge turns it as it moves."""
+    turned = math.sqrt(max(2.0 - 2.0 * dot(n, old), 0.0))
+    return turned > _TURNED and turned * max(d, 0.0) > _FASTER * math.sqrt(dot(moved, moved))
+
+
+@kernel
+def measure(
+    contact: Record, frame: Floats, p: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Records
+) -> float:
+    """Gap and normal of a contact whose centreline is at p now, kept in it; returns the distance of p [m], 0
+    where the contact is with another wall than the nearest."""
+    old, last, local = normal_of(contact), contact.place, to_obstacle(frame, p)
+    moved = mul(rotation_of(frame), (local[0] - last[0], local[1] - last[1], local[2] - last[2]))
+    d, n = wall_at(contact.obstacle, frame, p, old, margin, surfaces, stack, found)
+    contact.place[0], contact.place[1], contact.place[2] = local
+    if carries(contact) and _jumps(n, old, moved, d):
+        # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
+        contact.gap += dot(old, moved)
+        return 0.0
+    contact.gap = d - contact.radius
+    set_normal(contact, n)
+    return d
 
 
 @inline
@@ -149,43 +184,15 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
 
 
 @kernel
-def _segment_is_full(s: float, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """Whether this segment has as many contacts as it has nodes inside to put them on."""
-    k = segment_at(rules.arclength, rules.n_steps, s)
-    members = 0
-    for c in range(count):
-        members += segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
-    return members >= rules.n_steps - 1
-
-
-@kernel
 def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """An idle contact, open and beside one that presses: it is not wanted next, and its node is better spread
-    out."""
+    """An idle contact, open and beside one that presses: it is not wanted next."""
     if contacts[c].gap < 10.0 * rules.tolerance:
         return False
     for e in range(count):
-        if (
-            contacts[e].obstacle == contacts[c].obstacle
-            and abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
-            and carries(contacts[e])
-        ):
+        beside = abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
+        if beside and contacts[e].obstacle == contacts[c].obstacle and carries(contacts[e]):
             return True
     return False
-
-
-@kernel
-def _least_wanted(
-    s: float, gap: float, count: int, contacts: Records, rules: ContactRules, anywhere: bool
-) -> int:
-    """Least wanted of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap,
-    if it is wider than `gap`; -1 if none is."""
-    k, widest, at = segment_at(rules.arclength, rules.n_steps, s), gap, -1
-    for c in range(count):
-        here = anywhere or segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
-        if here and contacts[c].partner < 0 and contacts[c].gap > widest and not carries(contacts[c]):
-            widest, at = contacts[c].gap, c
-    return at
 
 
 @inline
@@ -198,8 +205,7 @@ def _other_wall(contact: Record, gap: float, away: float, tolerance: float) -> b
 @kernel
 def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
     """Drop the contacts that neither press nor may be wanted next; returns how many are left."""
-    n = 0
-    room = count <= len(contacts) - 4
+    n, room = 0, count <= len(contacts) - 4
     for c in range(count):
         contact = contacts[c]
         idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
@@ -223,7 +229,7 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
             contact.obstacle == candidate.obstacle
             and not contact.matched
             and away < nearest
-            and dot(normal_of(contact), normal) > 0.5
+            and dot(normal_of(contact), normal) > _ALIKE
             and not _other_wall(contact, candidate.gap, away, rules.tolerance)
         ):
             near, nearest = c, away
@@ -235,14 +241,14 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
-    near = rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
+    near = 0.5 * rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
     if candidate.gap >= contact.gap - near:
         return True
     if rules.still:
         return False
     away = abs(contact.arclength - candidate.arclength)
-    settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
-    if settles or not carries(contact) or rubs:
+    settles = away < max(0.5 * contact.shift, (_BESIDE if rubs else _CLOSE) * rules.spacing)
+    if settles or not carries(contact):
         contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
         return True
     return False
@@ -253,19 +259,21 @@ def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: Cont
     """Open a contact for a candidate, unless one with its normal is nearer than `apart`, or there is no room;
     returns how many there are."""
     s, gap, normal = candidate.arclength, candidate.gap, normal_of(candidate)
+    alike = _SAME_WALL if gap < -0.5 * rules.tolerance else _ALIKE
     for c in range(n):
         away = abs(contacts[c].arclength - s)
         if (
             contacts[c].obstacle == candidate.obstacle
             and away < apart
-            and dot(normal_of(contacts[c]), normal) > 0.5
+            and dot(normal_of(contacts[c]), normal) > alike
             and not _other_wall(contacts[c], gap, away, rules.tolerance)
         ):
             return n
-    at, segment_full = n, _segment_is_full(s, n, contacts, rules)
-    if (n >= len(contacts) or segment_full) and gap < -rules.tolerance:
-        at = _least_wanted(s, gap, n, contacts, rules, not segment_full)
-    if not 0 <= at < len(contacts):
+    at, widest = n, gap
+    for c in range(n if n == len(contacts) and gap < -rules.tolerance else 0):  # in place of an idle one
+        if contacts[c].partner < 0 and contacts[c].gap > widest and not carries(contacts[c]):
+            at, widest = c, contacts[c].gap
+    if at == len(contacts):
         return n
     radius = rules.radius[segment_at(rules.arclength, rules.n_steps, s)]
     open_contact(contacts[at], candidate.obstacle, s, normal, gap, radius)
@@ -283,7 +291,7 @@ def choose(n_found: int, found: Records, count: int, contacts: Records, rules: C
     for f in range(n_found):
         candidate = found[f]
         k = candidate.obstacle
-        apart = _CLOSE * rules.spacing if candidate.gap < -rules.tolerance else rules.spacing
+        apart = _CLOSE * rules.spacing if candidate.gap < -0.5 * rules.tolerance else rules.spacing
         near = _nearest(candidate, n, contacts, rules)
         if near >= 0:
             contacts[near].matched = True

@@ -24,10 +24,10 @@ from ..jit import inline, kernel
 from ..rod.gather import pick
 from ..vec import Vec, add, axpy, cross, dot, mul, mul_t, scale, sub
 from .bvh import Numbers, Record, normal_of
-from .centreline import bend_at, curve_before, curve_of, interval_of, point_at, rotation_at, tangent_at
-from .contact_set import carries, set_normal, wall_at
+from .centreline import bend_at, curve_of, curve_slip, interval_of, point_at, rotation_at, tangent_at
+from .contact_set import measure, set_normal
 from .rod_proximity import partner_of
-from .surface import rotation_of, surface_curvature, to_obstacle
+from .surface import surface_curvature
 from .tunnelling import carried
 
 SOFT = 1e-8
@@ -38,11 +38,10 @@ _ROUGHLY = 1e-4  # of the unknowns, where contacts are softer than they are
 _SMALL = 1e-13  # of the unknowns: a step below it is the last one
 _SHALLOW = 0.1  # of the slope along a step at its start: where it is as small, the step is long enough
 _PIVOT = 1e-12  # of a diagonal entry
-_TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
-_DAMPS, _STIFFENS, _MOST_DAMPED = 0.1, 8.0, 1e6
+_DAMPS, _STIFFENS, _MOST_DAMPED = 0.01, 4.0, 1e6
 """Part of its diagonal that is added to a Hessian with a negative pivot: first, times that, and at most."""
 _AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
-_RENEWED = 5e-6  # m: a slip that changes by less is kept for the next pass
+RENEWED = 5e-6  # m: friction times a slip that changes by less is kept for the next pass
 
 
 class PressedWorld(NamedTuple):
@@ -96,9 +95,6 @@ class Touching(NamedTuple):
     """(n_robots, n_points, 3, n_q) and rotation of the cross-sections there."""
     first: int
     """Number of the first contact among these points."""
-    gone: Floats
-    """(n_robots, n_obstacles, 6) displacement of free bodies, and moment on them, at which a rest was before:
-    what slips against them is counted from there."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
 
@@ -127,7 +123,7 @@ def _place(i: int, s: float, motion: ContactMotion) -> Vec:
 @inline
 def _surface_before(i: int, s: float, arm: Vec, motion: ContactMotion) -> Vec:
     """Place at the step's start of what is now `arm` away from the centreline."""
-    now, before = curve_of(motion, i), curve_before(motion, i)
+    now, before = curve_of(motion, i), curve_slip(motion, i)
     j, fraction = interval_of(now, s, 0)
     rotation = rotation_at(now, j, fraction)
     local = mul_t(rotation, arm)
@@ -137,34 +133,17 @@ def _surface_before(i: int, s: float, arm: Vec, motion: ContactMotion) -> Vec:
     return add(point_at(before, j, fraction), add(arm, turned))
 
 
-@inline
-def _jumps(n: Vec, old: Vec, moved: Vec, d: float) -> bool:
-    """A normal has turned by more than a place at this distance from an edge turns it as it moves."""
-    turned = math.sqrt(max(2.0 - 2.0 * dot(n, old), 0.0))
-    return turned > _TURNED and turned * max(d, 0.0) > _FASTER * math.sqrt(dot(moved, moved))
-
-
 @kernel
 def _measure_obstacle(
     i: int, contact: Record, all_of_it: Touching, stack: Numbers, wall: Records, curved: Floats
 ) -> Vec:
     """Gap and normal of a contact with an obstacle, kept in it, the second derivative of the gap, and the
-    slip since the step's start (world)."""
+    slip since the last step (world)."""
     motion, surfaces, k = all_of_it.motion, all_of_it.surfaces, contact.obstacle
     p = _place(i, contact.arclength, motion)
     frame = motion.frames[pick(i, len(motion.frames)), k]
-    margin = motion.margin * all_of_it.rods.length[i]
-    old, last, local = normal_of(contact), contact.place, to_obstacle(frame, p)
-    moved = mul(rotation_of(frame), (local[0] - last[0], local[1] - last[1], local[2] - last[2]))
-    d, n = wall_at(k, frame, p, old, margin, surfaces, stack, wall)
-    first, second, e = 0.0, 0.0, (0.0, 0.0, 1.0)
-    contact.place[0], contact.place[1], contact.place[2] = local
-    if carries(contact) and _jumps(n, old, moved, d):
-        # in a crease: what it presses on is beside what is nearest now, which is another contact's matter
-        n, contact.gap, d = old, contact.gap + dot(old, moved), 0.0
-    else:
-        contact.gap = d - contact.radius
-    set_normal(contact, n)
+    d = measure(contact, frame, p, motion.margin * all_of_it.rods.length[i], surfaces, stack, wall)
+    n, first, second, e = normal_of(contact), 0.0, 0.0, (0.0, 0.0, 1.0)
     if d > 0.0:
         first, second, e = surface_curvature(k, frame, p, surfaces, stack)
     for a in range(3):
@@ -378,7 +357,7 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedW
 
 
 @kernel
-def body_of(k: int, surfaces: Surfaces) -> int:
+def _body_of(k: int, surfaces: Surfaces) -> int:
     """Number of the first obstacle of the body that obstacle k is scaled of: the numbers of bodies are the
     user's."""
     first = k
@@ -449,6 +428,8 @@ def gather_world(
             )
             law[0], law[1] = mu if slides else 0.0, SOFT + soft
             law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
+            if law[4] < 0.0:  # of a new contact: as far as its place has come
+                law[4] = math.sqrt(pressing.free[m, 1] ** 2 + pressing.free[m, 2] ** 2)
             _along_axes(axes, pressing.curved[m])
             for r in range(3):
                 for a in range(most):
@@ -457,12 +438,9 @@ def gather_world(
             if other >= 0:
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
             elif surfaces.mobility[k, 0] > 0.0:
-                at = n + 6 * body_of(k, surfaces)
+                at = n + 6 * _body_of(k, surfaces)
                 place = _place(i, contact.arclength, all_of_it.motion)
                 _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
-                for r in range(1, 3):
-                    for a in range(6):
-                        pressing.free[m, r] -= pressing.along[m, r, at + a] * all_of_it.gone[i, k, a]
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
@@ -480,7 +458,7 @@ def gather_world(
                     pressing.gradient[a] += pressed * pressing.along[m, r, a]
             m += 1
     for k in range(n_obstacles if most > n else 0):
-        mobility, at = surfaces.mobility[k], n + 6 * body_of(k, surfaces)
+        mobility, at = surfaces.mobility[k], n + 6 * _body_of(k, surfaces)
         if mobility[0] > 0.0:
             for a in range(3):
                 pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)
@@ -692,10 +670,11 @@ def _minimise(
 
 
 @kernel
-def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool, still: bool) -> bool:
+def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: float, still: bool) -> bool:
     """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
-    changed, where it may (`renew`). `still`: contacts stay where they are. Where Newton's method takes long
-    (many contacts slip, in directions that they have yet to find), contacts are soft first."""
+    changed, by more than `renew` [m] times its friction. `still`: contacts stay where they are. Where
+    Newton's method takes long (many contacts slip, in directions that they have yet to find), contacts are
+    soft first."""
     for a in range(n):
         pressing.step[a] = 0.0
     if not still:
@@ -716,7 +695,7 @@ def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: b
 
 
 @kernel
-def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: bool) -> bool:
+def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: float) -> bool:
     """Forces and slips after the step, to both sides of a contact; whether a slip has changed."""
     changed = False
     for k in range(m):
@@ -725,8 +704,10 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
         y = _requested(law, _moved(n, pressing.along[k], pressing.free[k], pressing.step))
         force, _ = in_cone(law[0], y)
         slid = law[1] * math.sqrt((y[1] - force[1]) ** 2 + (y[2] - force[2]) ** 2) if law[0] > 0.0 else 0.0
-        if renew and law[0] * abs(slid - contact.slid) > _RENEWED:
-            contact.slid, changed = slid, True
+        least = renew if contact.slid >= 0.0 else min(renew, RENEWED)
+        if law[0] * abs(slid - law[4]) > least:
+            law[4], changed = slid, True
+        contact.slid = law[4]
         for a in range(3):
             contact.force[a] = force[0] * axes[0, a] + force[1] * axes[1, a] + force[2] * axes[2, a]
         if side[2] >= 0:
@@ -738,8 +719,8 @@ def _report_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
 
 
 @kernel
-def end_contacts(n: int, contacts: Records) -> int:
-    """Keep the contacts that press for the next step, and the force along the surface with which each ends;
+def end_contacts(n: int, contacts: Records, step_ends: bool) -> int:
+    """Keep the contacts that press, and where the step ends the force along the surface with which each does;
     returns how many there are."""
     left = 0
     for c in range(n):
@@ -748,7 +729,8 @@ def end_contacts(n: int, contacts: Records) -> int:
         if not dot(force, force) > 0.0:
             continue
         along = sub(force, scale(dot(force, normal_of(contact)), normal_of(contact)))
-        contact.held[0], contact.held[1], contact.held[2] = along
+        if step_ends:
+            contact.held[0], contact.held[1], contact.held[2] = along
         if left != c:
             contacts[left] = contact
         left += 1
