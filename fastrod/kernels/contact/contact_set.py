@@ -22,8 +22,8 @@ _SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two fa
 _SAME_GAP = 1e-9  # m; a contact does not move for less
 _ALIKE = 0.5  # cosine of normals that may be of one contact
 _TURNED, _FASTER = 0.02, 10.0  # rad, and times that: a normal that turns by more jumps
-# of a step: the least that two contacts of one obstacle are apart; and with friction, which would share the load
-# of one place with as much right
+# of a step: the least that two contacts of one obstacle are apart; with friction, where both would share the
+# load of one place in any proportion
 _CLOSE, _BESIDE = 1e-3, 1e-2
 
 
