@@ -47,6 +47,7 @@ _MOVING = 2  # passes in which contacts follow the places where the gap is least
 _RENEWING, _NEAR, _EXACTLY = 2, 1e-3, 5e-8
 _STILL = 1e-6  # rad: a Newton step below it is the last one
 _FARTHEST = 1e3  # rad: after a Newton step that is longer there is no next one
+_KNOT = 3.0  # rad, from node to node: a rod that bends by more is none
 _SAME_GAP = 1e-10  # m
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
@@ -371,7 +372,7 @@ class TouchingRods(ModalRods):
             worlds = engine.in_worlds(left)
             left = worlds.robot
             world, near, n_found = self._seen(left, ports, how, q, found, frames)
-            through = self._mask(left[n_found < 0])
+            through = self._mask(left[(n_found < 0) | self._knotted(left, found.shape)])
             if count == 0 and through.any():  # at that speed it would go through: from where it is
                 q[through] = start[through]
                 world, near, n_found = self._seen(left, ports, how, q, found, frames)
@@ -440,6 +441,12 @@ class TouchingRods(ModalRods):
         self._go_back(failed, then)
         modal.place_points(acting.points, ports.extension)
         return ok
+
+    def _knotted(self, rows: Ints, shape: RodShape) -> Flags:
+        """(n,) whose curvature its nodes no longer resolve: Newton's method has left for nowhere, where sums
+        overflow and steps look small."""
+        bend = np.abs(shape.curvature[rows]).max((1, 2)) * self.engine.rods.spacing[rows]
+        return np.asarray(~(bend < _KNOT))
 
     def _note_nearest(self, rows: Ints, near: Any, n_found: Ints) -> None:
         """Note what robots without a balance were nearest to, for their sentence."""

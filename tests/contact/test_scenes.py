@@ -13,6 +13,7 @@ import pytest
         (1, 7, [4]),  # a noisy sphere at 10 steps a segment: 0.21 mm between the nodes
         (1, 102, [1, 7]),  # another at 6 steps: 0.06 and 0.09 mm
         (1, 38, [5]),  # five segments, 10 steps: 0.06 mm
+        (1, 81, [2]),  # a thin plate, from which Newton's method left for 1e24 m
         (1, 0, None),
         (1, 1, None),
         (1, 3, None),
