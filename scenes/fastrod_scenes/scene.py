@@ -24,6 +24,7 @@ _SCENES: Mapping[str, str] = {
     "dual_arm": "fastrod_scenes.ur5.dual_arm:DualArms",
     "explore": "fastrod_scenes.ur5.explore:Explore",
     "grid": "fastrod_scenes.grid:Grid",
+    "insertion": "fastrod_scenes.contact.insertion:Insertion",
     "neck_look": "fastrod_scenes.a1.look:NeckLook",
     "neck_push": "fastrod_scenes.a1.push:NeckPush",
     "pair": "fastrod_scenes.contact.pair:Pair",

@@ -23,6 +23,7 @@ ROD_SCENES: Mapping[str, str] = {
     "bar": "The five-segment reacher closes around a bar and grips it.",
     "draped": "A cylinder rises under a heavy, sagging rod, which drapes itself over it.",
     "grid": "Sixty-four five-segment reachers sway in waves, each with a phase of its own, in one simulator.",
+    "insertion": "A soft, bent tip is pushed through a ribbed tube: every rib holds it until it jumps over.",
     "pair": "A rod bends onto another that crosses it, and the two press on each other.",
     "wall": "The prototype's tendons press its tip against a wall, and it slides along it.",
 }
