@@ -21,7 +21,7 @@ STIFFNESS, SOFT, DENSITY, DAMPING = 2e-3, 1e-4, 0.03, 2e-3
 BEND, BENDS = 1.2, 0.4
 """Bend of the tip, which presses it against the wall [rad], and how long it takes [s]."""
 N_RIBS, BORE, RIB, PITCH, WALL = 5, 0.009, 0.0016, 0.01, 0.004
-"""Constants of the tube: its ribs; its inner radius between them, their height, their distance, its wall [m]."""
+"""Constants of the tube: how many ribs; its radius between, their height and distance, its wall [m]."""
 FRICTION, SPEED, DEPTH = 0.3, 0.02, 0.006
 """Friction of the wall, speed of the base [m/s], depth of the straight tip at first [m]."""
 FASTER, SLOWER = 1.75, 0.5
