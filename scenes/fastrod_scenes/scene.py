@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _SCENES: Mapping[str, str] = {
     "airway": "fastrod_scenes.contact.airway:Airway",
     "bar": "fastrod_scenes.contact.bar:Bar",
+    "catch": "fastrod_scenes.contact.catch:CatchCube",
     "draped": "fastrod_scenes.contact.draped:Draped",
     "dual_arm": "fastrod_scenes.ur5.dual_arm:DualArms",
     "explore": "fastrod_scenes.ur5.explore:Explore",

@@ -29,6 +29,7 @@ ROD_SCENES: Mapping[str, str] = {
 }
 """Scenes without a host, and what they are about: each scene's own sentence, here without importing it."""
 HOSTED_SCENES: Mapping[str, str] = {
+    "catch": "A soft robot that hangs from a post catches a thrown cube: its hook closes and holds it.",
     "dual_arm": "A UR5 carries two soft robots that move in opposite phase, and feels the sum of both.",
     "explore": "A soft robot on a UR5 enters a box and, the UR5 held still, looks at each of its eight "
     "corners.",
