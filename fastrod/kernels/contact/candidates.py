@@ -93,6 +93,8 @@ def renew_contacts(
     centre, wall = room
     margin = motion.margin * rods.length[i]
     face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)
+    # with friction a contact that compares the present gap with its own of a pass before leaves its place too
+    # late; without it, one that always follows swings between its neighbours
     for c in range(contacts.used[i]):
         k = contact[c].obstacle
         if k < len(frames) and surfaces.friction[k] > 0.0:
