@@ -393,7 +393,7 @@ class TouchingRods(ModalRods):
                 self._note_nearest(left, near, n_found)
                 break
             still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
-            placed = contacts.used.copy(), contacts.contact["arclength"].copy()
+            before = contacts.used.copy(), contacts.contact["arclength"].copy()
             self._renew(left, seen, near, n_found, still)
             if engine.rods_meet:
                 closer = 0.01 * _INSIDE if still else _SAME_GAP
@@ -415,7 +415,7 @@ class TouchingRods(ModalRods):
             q[left] += step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
-            known = (contacts.used == placed[0]) & (contacts.contact["arclength"] == placed[1]).all(1)
+            known = (contacts.used == before[0]) & (contacts.contact["arclength"] == before[1]).all(1)
             known &= self.dynamics and count > 0
             by = np.where(known[left], np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
             over[left] = by / (1.0 - by) * size[left]
