@@ -166,7 +166,7 @@ class TouchingRods(ModalRods):
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
             what = "come there in smaller steps"
             if folds[i] > FOLDS:
-                what = f"it bends to {folds[i]:.2g} / (offset of a tendon), which folds at 1: bend it less"
+                what = f"its curvature times a tendon's offset is {folds[i]:.2g}; at 1 it folds: bend it less"
             said, kind = f"{said}; {what}.", Problem.CONTACT_STUCK
             if self._through[i]:
                 said = f"contact{where}: the rod would go through it; take smaller steps, or go around it."

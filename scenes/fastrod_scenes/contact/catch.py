@@ -12,6 +12,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 from fastrod.model.segment_actions import SegmentActions, TendonInputs
 from fastrod_scenes.scene import HostedScene, SceneStage
+from fastrod_scenes.ur5.carried import eased
 
 HEIGHT = 0.6
 """Height of the mount, from which the robot hangs along -z [m]."""
@@ -25,8 +26,8 @@ OPEN, CLOSED = 2.7, 6.0
 """Bend of the last three segments together, before and after [rad]."""
 BEGINS, TAKES = 0.25, 0.3
 """Begin of the closing, and how long it takes [s]."""
-STILL = 0.02
-"""Largest speed of the cube at the end [m/s]."""
+STILL, MEAN = 0.02, 0.2
+"""Largest speed of the cube at the end [m/s]; time over which forces are meant, before the end [s]."""
 _CURLED = np.array([0.0, 0.0, 1.0, 1.0, 1.0]) / 3.0  # of the bend, by segment
 
 
@@ -74,8 +75,7 @@ class _Catch(SceneStage):
 
     def hook(self, t: float) -> TendonInputs:
         """Open, then closed, eased."""
-        x = min(max((t - BEGINS) / TAKES, 0.0), 1.0)
-        bend = OPEN + (CLOSED - OPEN) * x * x * (3.0 - 2.0 * x)
+        bend = OPEN + (CLOSED - OPEN) * eased((t - BEGINS) / TAKES)
         action = np.zeros(self.actions.n_actions)
         action[1::3] = bend * _CURLED * self.actions.offset
         return self.actions.inputs(action)
@@ -100,7 +100,7 @@ class CatchCube(HostedScene):
         stage = self.stage()
         world, rod, cube = stage.world, stage.rod, stage.cube
         before, momentum, passes = np.array(SPEED), 0.0, []
-        last, count = 0.0, 0
+        last, count, holds, bears, share = 0.0, 0, 0.0, 0.0, self.dt / MEAN
         for t in self.play(stage):
             state = rod.state
             assert state is not None
@@ -111,7 +111,9 @@ class CatchCube(HostedScene):
             momentum = max(momentum, float(np.abs(MASS * (velocity - before) - given).max()))
             before, last, count = velocity, float(np.linalg.norm(velocity)), int(state.contacts.count[0])
             passes.append(float(state.passes[0]))
-        holds, bears = float(rod.body_contacts[0].exerted[2]), -float(rod.wrench[2])
+            if t > self.duration - MEAN + 0.5 * self.dt:
+                holds += share * float(rod.body_contacts[0].exerted[2])
+                bears -= share * float(rod.wrench[2])
         weight, together = 9.81 * MASS, 9.81 * (MASS + DENSITY * _robot().length)
         self.expect(
             momentum < 1e-6, f"the cube's momentum changes by {momentum:.3g} N s beside what acts on it."
