@@ -100,7 +100,7 @@ class CatchCube(HostedScene):
         stage = self.stage()
         world, rod, cube = stage.world, stage.rod, stage.cube
         before, momentum, passes = np.array(SPEED), 0.0, []
-        last, count, holds, bears, share = 0.0, 0, 0.0, 0.0, self.dt / MEAN
+        last, count, holds, bears, fraction = 0.0, 0, 0.0, 0.0, self.dt / MEAN
         for t in self.play(stage):
             state = rod.state
             assert state is not None
@@ -112,8 +112,8 @@ class CatchCube(HostedScene):
             before, last, count = velocity, float(np.linalg.norm(velocity)), int(state.contacts.count[0])
             passes.append(float(state.passes[0]))
             if t > self.duration - MEAN + 0.5 * self.dt:
-                holds += share * float(rod.body_contacts[0].exerted[2])
-                bears -= share * float(rod.wrench[2])
+                holds += fraction * float(rod.body_contacts[0].exerted[2])
+                bears -= fraction * float(rod.wrench[2])
         weight, together = 9.81 * MASS, 9.81 * (MASS + DENSITY * _robot().length)
         self.expect(
             momentum < 1e-6, f"the cube's momentum changes by {momentum:.3g} N s beside what acts on it."
