@@ -13,13 +13,12 @@ from fastrod.model.routing import route
 from fastrod.rotation import product, quaternion_from_matrix, quaternion_from_vector
 from fastrod_device.bench.latency import estimate_latency
 from fastrod_device.bench.workbench import emulated
-from fastrod_device.columns import FLAGS
 from fastrod_device.errors import RefusedError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.vision.camera import Camera, CameraFrame, Marker
 from fastrod_device.vision.drawing import draw
 from fastrod_device.vision.gates import ASTRAY, OUTSIDE, TOO_FAST
-from fastrod_device.vision.tracker import MarkerTracker
+from fastrod_device.vision.tracker import FLAGS, MarkerTracker
 from report import Measurement, Row, Section, bench, note_progress, table
 
 SIZE, FOCAL, PICTURE = 0.015, 800.0, (640, 480)

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from fastrod.kernels import batch, contact_batch, modal_batch, notice, press_batch
+from fastrod.kernels import batch, contact_batch, jit, modal_batch, press_batch
 
 SCRIPT = """
 import numpy as np
-from fastrod.kernels import notice
+from fastrod.kernels import jit
 from fastrod.kernels.operators import play, relaxation
-notice.SECONDS["play"] = "backlash", 1
+jit.SECONDS["play"] = "backlash", 1
 one = np.zeros((1, 1))
 play(np.zeros((1, 1, 1)), np.zeros((1, 3)), one, one)
 relaxation(np.zeros((1, 1, 1)), np.zeros((1, 2)), one, one + 1.0, np.ones(1))
@@ -58,9 +58,9 @@ class Compilation:
 
 
 @pytest.fixture
-def listener(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[notice._Around]:
+def listener(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[jit._Around]:
     monkeypatch.delenv("FASTROD_QUIET", raising=False)
-    yield notice._Around(getattr(request, "param", True))
+    yield jit._Around(getattr(request, "param", True))
     gc.enable()
 
 
@@ -73,19 +73,19 @@ def listener(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) ->
     indirect=["listener"],
 )
 def test_each_group_of_large_kernels_has_one_line(
-    listener: notice._Around, how_often: str, capsys: pytest.CaptureFixture[str]
+    listener: jit._Around, how_often: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contact = contact_batch.search_some, press_batch.press_some
     for kernel in (*contact, batch.pass_some, batch.place_all, modal_batch.pass_modes):
         listener.on_start(Compilation(kernel.py_func))  # type: ignore[union-attr]
         listener.on_end(None)
     listener.on_start(Compilation(os.getenv))  # somebody else's
-    groups = (notice.SECONDS[name] for name in ("press_some", "pass_some", "pass_modes"))
+    groups = (jit.SECONDS[name] for name in ("press_some", "pass_some", "pass_modes"))
     lines = [f"Compiling the kernels of {what}, about {seconds} s, {how_often}." for what, seconds in groups]
     assert capsys.readouterr().err.splitlines() == lines
 
 
-def test_garbage_is_not_collected_until_the_outermost_compilation_ends(listener: notice._Around) -> None:
+def test_garbage_is_not_collected_until_the_outermost_compilation_ends(listener: jit._Around) -> None:
     for _ in range(2):
         listener.on_start(Compilation(os.getenv))
         assert not gc.isenabled()
@@ -95,7 +95,7 @@ def test_garbage_is_not_collected_until_the_outermost_compilation_ends(listener:
     assert gc.isenabled()
 
 
-def test_garbage_is_left_alone_where_the_user_collects_none(listener: notice._Around) -> None:
+def test_garbage_is_left_alone_where_the_user_collects_none(listener: jit._Around) -> None:
     gc.disable()
     listener.on_start(Compilation(os.getenv))
     listener.on_end(None)

@@ -85,7 +85,7 @@ def test_a_step_settles_the_robots_whose_pass_diverged_and_no_others(case: str) 
     for one, other in zip(sim._chain.links, bare._chain.links, strict=True):
         assert_array_equal(one.memory, other.memory)  # a step of the effects, not two
     inputs = made(case)[1]
-    if not sim._chain:
+    if not sim._chain.links:
         fresh = Simulator(REACHER, N, points_per_segment=6, threads=1)
         assert_allclose(state.tip_position[ROWS], fresh.settle(**inputs(3)).tip_position[ROWS], atol=1e-7)
     after = sim.step(**inputs(3))

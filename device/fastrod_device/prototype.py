@@ -20,7 +20,6 @@ from fastrod.logs.link import Measurement
 from fastrod.logs.recording import Recorder
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
-from fastrod_device import columns
 from fastrod_device.can.clock import Clock, WallClock
 from fastrod_device.can.faultcodes import in_words
 from fastrod_device.can.pacer import Pacer, urgent, urgently
@@ -35,8 +34,12 @@ from fastrod_device.safety_words import of_exception
 from fastrod_device.units import Transmission
 from fastrod_device.vision.camera import CameraFrame, FrameSource
 from fastrod_device.vision.gates import FROZEN, REPEATED, Expectation, Workspace
-from fastrod_device.vision.tracker import MarkerSighting, MarkerTracker, outlined
+from fastrod_device.vision.tracker import FLAGS, MarkerSighting, MarkerTracker, outlined
 
+EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
+"""Columns of a recording that only a prototype has: reprojection error [px], size of the marker in the
+picture [px], place of the sighting's flag in `vision.tracker.FLAGS` (0: trusted), and where the tip was seen,
+trusted or not [m]; then current_1 ... [A]."""
 Plan = Callable[[float], Floats]
 """Seconds since it began -> (n_tendons,) changes of tendon length [m], negative = pulled."""
 
@@ -331,7 +334,7 @@ class Prototype:
 
         Where its rows have to move, the journal has a line of kind "recording".
         """
-        extra = columns.names(self.robot.n_tendons)
+        extra = (*EXTRA, *(f"current_{k}" for k in range(1, self.robot.n_tendons + 1)))
 
         def moved(sentence: str) -> None:
             self.journal.write(self.clock.now(), "recording", sentence)
@@ -449,7 +452,7 @@ class Prototype:
             recorder = self.recorder
             if recorder is None or not recorder.recording:
                 return
-            row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
+            row, extra = self._measured(sighting, ""), _extra(sighting, self.readings)
             commanded = self._lengths_at(sighting.t)[1]
             try:
                 recorder.add(
@@ -508,3 +511,10 @@ class Prototype:
         urgent()
         while not self._closed.wait(_WATCHED):
             self.supervisor.stalled(self.clock.now())
+
+
+def _extra(sighting: MarkerSighting, readings: Readings | None) -> dict[str, float]:
+    """The columns of a row that only a prototype has; currents are left out where none are known."""
+    seen = (sighting.error, sighting.size_px, float(FLAGS.index(sighting.flag)), *sighting.position.tolist())
+    currents = [] if readings is None else readings.current.tolist()
+    return dict(zip(EXTRA, seen, strict=True)) | {f"current_{k}": x for k, x in enumerate(currents, 1)}

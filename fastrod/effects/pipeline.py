@@ -87,9 +87,14 @@ class EffectPipeline:
         self.pulls_tip = False
         """A force that depends on where the tip is has acted."""
         self._tip_links = [link for link in self.links if executor.feels_tip(link.effect)]
+        self.feels_tip = bool(self._tip_links)
+        """Whether an effect's force depends on where the tip is."""
         self._reads_tension = any(executor.reads_tension(link.effect) for link in self.links)
         self._tension = np.zeros((n_robots, self.routing.n_tendons))
         self._reads_bend = any(executor.reads_bend(link.effect) for link in self.links)
+        self.follows = self.feels_tip or self._reads_tension or self._reads_bend
+        """Whether an effect depends on what the rod does: on where its tip is, how it is bent, or its
+        tendons' tension."""
         self._bend = np.zeros((n_robots, self.routing.n_segments, 2))
         self._fraction = np.ones(n_robots)
         self._off: Floats | None = None
@@ -107,20 +112,6 @@ class EffectPipeline:
                 for robot in robots
             ]
         )[:, None, None] * (np.eye(3) / 3.0)
-
-    def __bool__(self) -> bool:
-        return bool(self.links)
-
-    @property
-    def feels_tip(self) -> bool:
-        """Whether an effect's force depends on where the tip is."""
-        return bool(self._tip_links)
-
-    @property
-    def follows(self) -> bool:
-        """Whether an effect depends on what the rod does: on where its tip is, how it is bent, or its
-        tendons' tension."""
-        return self.feels_tip or self._reads_tension or self._reads_bend
 
     def reset(self, rows: Any) -> None:
         """Let these robots begin at rest again."""

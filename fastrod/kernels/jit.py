@@ -7,6 +7,7 @@ of numba's version; that of a function which is called by its address (`pointed`
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import sys
@@ -20,12 +21,58 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
-from .notice import announce
+_register: Any = event.register  # it has no types
+_PLACE = "fastrod.kernels."
+SECONDS = {
+    "pass_some": ("the rod", 40),
+    "search_some": ("contact", 45),
+    "press_some": ("contact", 45),
+    "pass_modes": ("modes", 50),
+    "derive_modes": ("derivatives of modes", 15),
+}
+"""Purpose of the large kernels, and the time that each group takes to compile on one core of 2025 [s]
+(`fastrod warmup`)."""
+
+
+class _Around(event.Listener):
+    """Print one line before each group of kernels that is compiled in a process, and collect no garbage until
+    the outermost compilation has ended."""
+
+    def __init__(self, cached: bool) -> None:
+        why = "in each process, for no cache folder can be written (FASTROD_CACHE_DIR names one)"
+        self._how_often = "once" if cached else why
+        self._printed: set[str] = set()
+        self._depth, self._collects = 0, False
+
+    def on_start(self, what: Any) -> None:
+        """Print, unless `FASTROD_QUIET` is set or this line was printed before."""
+        if self._depth == 0:
+            self._collects = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+        function = what.data["dispatcher"].py_func
+        group = SECONDS.get(function.__name__) if function.__module__.startswith(_PLACE) else None
+        if group and not os.environ.get("FASTROD_QUIET") and group[0] not in self._printed:
+            self._printed.add(group[0])
+            line = f"Compiling the kernels of {group[0]}, about {group[1]} s, {self._how_often}."
+            print(line, file=sys.stderr, flush=True)
+
+    def on_end(self, what: Any) -> None:  # noqa: ARG002
+        """Collect garbage again, if it was collected before."""
+        self._depth -= 1
+        if self._depth == 0 and self._collects:
+            gc.enable()
+
+
+def announce(cached: bool) -> None:
+    """Print a line on stderr before kernels are compiled in this process, `cached` for later ones or not."""
+    _register("numba:compile", _Around(cached))
+
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _config: Any = numba.config

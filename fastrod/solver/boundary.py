@@ -232,6 +232,17 @@ class BoundarySolver:
             new.force_before[:] = force
         return new
 
+    def stretch(self, rows: Ints, change: Floats) -> None:
+        """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the
+        tendons that grow along with their segments are, for the boundary, as they were. The gain knows of
+        tendons alone; it would pull at every one."""
+        if not change.any():
+            return
+        grown = np.cumsum(change, axis=1)[:, self.layout.tendon_segment[self.layout.row_tendon]]
+        if not np.isfinite(grown).all():
+            grown = np.where(np.isfinite(grown), grown, 0.0)
+        self.memory.length_before[rows] += grown if len(grown) == 1 else grown[rows]
+
     def arrive_at(self, rows: Ints, ports: Ports) -> None:
         """These robots were brought to these inputs by another way than a step: the next one moves from
         there."""

@@ -15,7 +15,7 @@ from fastrod.kernels.jit import LANES
 from fastrod.kernels.modal_batch import derive_modes, pass_modes
 from fastrod.kernels.rod.modal.chunk import ModalRun
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
-from fastrod.kernels.rod.modal.fields import ModalWork
+from fastrod.kernels.rod.modal.fields import ModalWork, modal_workspace
 from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.modes import (
@@ -31,7 +31,6 @@ from fastrod.kernels.rod.modal.modes import (
 )
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
 from fastrod.kernels.rod.modal.output import ModalOutput, ModalSamples, MotionShape
-from fastrod.kernels.rod.modal.workspace import modal_workspace
 from fastrod.model.robot import Robot, Segment
 from fastrod.solver.options import Modes, SchemeName
 from fastrod.solver.protocol import Acting

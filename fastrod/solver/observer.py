@@ -15,7 +15,7 @@ from fastrod.solver.inputs import Inputs
 from fastrod.solver.options import Observer
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.recovery import Boundary, unstable
-from fastrod.solver.response import Linear, stretch
+from fastrod.solver.response import Linear
 from fastrod.solver.settle import LOST, cold_start, frozen_pass, settle
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, RodShape
 
@@ -86,11 +86,11 @@ class ObserverSolver:
         if before is not None:
             if self._learns and _alike(before, ports):
                 self.learn(rows[last.warm[rows]], before)
-            stretch(passes, rows, ports.extension - before.extension)
+            passes.stretch(rows, ports.extension - before.extension)
         if len(cold := rows[~last.warm[rows]]):
             cold_start(cold, passes.layout, passes.params, ports, passes.memory)
-        linear, jacobian = Linear(passes, rows, ports), None
-        if how.derive and len(rows) == n and linear.fits(turning=True):
+        jacobian = None
+        if how.derive and len(rows) == n and (linear := Linear(passes, rows, ports)).fits(turning=True):
             process, noise = self.noise
             shape, jacobian = linear.step(how.relocate, True, self.outputs, process=process, noise=noise)
         else:

@@ -256,16 +256,3 @@ def inverse(a: Floats) -> Floats:
             pass
     found[good] = np.linalg.pinv(a[good])
     return found
-
-
-def stretch(passes: BoundarySolver, rows: Ints, change: Floats) -> None:
-    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the tendons
-    that grow along with their segments are, for the boundary, as they were. The gain knows of tendons alone;
-    it would pull at every one."""
-    if not change.any():
-        return
-    layout = passes.layout
-    grown = np.cumsum(change, axis=1)[:, layout.tendon_segment[layout.row_tendon]]
-    if not np.isfinite(grown).all():
-        grown = np.where(np.isfinite(grown), grown, 0.0)
-    passes.memory.length_before[rows] += grown if len(grown) == 1 else grown[rows]

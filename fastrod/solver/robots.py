@@ -254,7 +254,7 @@ class RobotBatch:
         out[list(self._reader.problems)] = True
         some_out = bool(out.any())
         rows = np.flatnonzero(~out) if some_out else self._all
-        if self._chain:
+        if self._chain.links:
             bare, params = self._bare, self._params
             self._bare = ports
             ports, self._params, points = self._chain.act(

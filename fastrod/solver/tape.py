@@ -9,8 +9,9 @@ unknowns are central differences, of which the error is that of rounding for all
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,6 @@ from fastrod.errors import InputError, RobotError, nearest
 from fastrod.kernels.rod.modal.derivatives import AFTER_JUMP, ModalDerivatives, scheme_table
 from fastrod.kernels.rod.modal.motion import BDF1, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
 from fastrod.model.compile import compile_robots
-from fastrod.model.numbers import number, with_number
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Reader
 from fastrod.solver.modal import ModalSolver, Step
@@ -452,3 +452,63 @@ def _as_tips(place: Floats, velocity: Floats) -> Tips:
     """Return the numbers of the last node (n_calls, n_robots, 12, ...) as tips."""
     directors = place[:, :, 3:].reshape(*place.shape[:2], 3, 3, *place.shape[3:])
     return Tips(place[:, :, :3], np.swapaxes(directors, 2, 3), velocity[:, :, :3])
+
+
+_LISTS = {"segment": "segments", "lump": "lumps"}
+
+
+def number(robot: Robot, name: str) -> float:
+    """The value. Raises `InputError` where this is no number of the robot."""
+    at: Any = robot
+    for step, _ in _steps(robot, name):
+        at = at[step] if isinstance(step, int) else getattr(at, step)
+    return float(at)
+
+
+def with_number(robot: Robot, name: str, value: float) -> Robot:
+    """The robot with another value there. Raises `InputError` as `number`, `RobotError` where the value
+    cannot be."""
+    return _replaced(robot, [step for step, _ in _steps(robot, name)], value)  # type: ignore[no-any-return]
+
+
+def _replaced(at: Any, steps: list[Any], value: float) -> Any:
+    if not steps:
+        return value
+    first, *rest = steps
+    if isinstance(first, int):
+        return (*at[:first], _replaced(at[first], rest, value), *at[first + 1 :])
+    return dataclasses.replace(at, **{first: _replaced(getattr(at, first), rest, value)})
+
+
+def _steps(robot: Robot, name: str) -> list[tuple[Any, Any]]:
+    """Attributes and indices that lead to the number, each with what stands there."""
+    words, found = name.split("."), []
+    at: Any = robot
+    if words[0] == "tendon" and len(words) > 1:
+        k = _index(words[1], robot.n_tendons, "tendon", name)
+        for s, segment in enumerate(robot.segments):
+            if k < len(segment.tendons):
+                words = ["segment", str(s + 1), "tendons", str(k + 1), *words[2:]]
+                break
+            k -= len(segment.tendons)
+    for word in words:
+        if isinstance(at, tuple):
+            step: Any = _index(word, len(at), "entry", name)
+            at = at[step]
+        else:
+            step = _LISTS.get(word, word)
+            known = [field.name for field in dataclasses.fields(at)] if dataclasses.is_dataclass(at) else []
+            if step not in known:
+                raise InputError(f"the robot has no number {name!r}: {word!r}; {nearest(word, known)}")
+            at = getattr(at, step)
+        found.append((step, at))
+    if isinstance(at, bool) or not isinstance(at, (int, float)):
+        more = f"; name one of its entries, {name}.1" if isinstance(at, tuple) and at else ""
+        raise InputError(f"{name!r} is no number of the robot{more}.")
+    return found
+
+
+def _index(word: str, count: int, what: str, name: str) -> int:
+    if not word.isdigit() or not 1 <= int(word) <= count:
+        raise InputError(f"{name!r}: {word!r} is no {what} of {count}; they are counted from 1.")
+    return int(word) - 1

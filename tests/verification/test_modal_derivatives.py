@@ -12,10 +12,9 @@ from fastrod.kernels.jit import entry
 from fastrod.kernels.rod.lanes import W
 from fastrod.kernels.rod.modal import fields as ml
 from fastrod.kernels.rod.modal.assembly import assemble
-from fastrod.kernels.rod.modal.fields import ModalWork
+from fastrod.kernels.rod.modal.fields import ModalWork, modal_workspace
 from fastrod.kernels.rod.modal.modes import ModalBasis, integral_row, modal_basis
 from fastrod.kernels.rod.modal.newton import sweep
-from fastrod.kernels.rod.modal.workspace import modal_workspace
 
 LENGTH, DENSITY, TAU, ALPHA, RATE = 0.08, 0.3, 0.01, 50.0**2, 50.0
 PRETENSION, COMPLIANCE = 1.0, 1e-4

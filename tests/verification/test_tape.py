@@ -10,9 +10,8 @@ from numpy.testing import assert_allclose
 
 from fastrod import Robot, Segment, Simulator, Tendon
 from fastrod.errors import InputError
-from fastrod.model.numbers import number, with_number
 from fastrod.model.robot import Lump
-from fastrod.solver.tape import Tape, Tips
+from fastrod.solver.tape import Tape, Tips, number, with_number
 
 DT = 1e-3
 

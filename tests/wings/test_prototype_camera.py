@@ -11,12 +11,12 @@ import pytest
 from benches import started
 
 from fastrod_device.can.clock import Clock
-from fastrod_device.columns import FLAGS
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.safety import SafetyState
 from fastrod_device.vision.camera import CameraFrame, Picture
 from fastrod_device.vision.drawing import DrawnScene, Eye
+from fastrod_device.vision.tracker import FLAGS
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")

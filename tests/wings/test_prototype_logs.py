@@ -16,9 +16,9 @@ from fastrod.logs.recording import recover
 from fastrod.logs.runlog import read_log
 from fastrod.types import Floats
 from fastrod_device.can.clock import Clock
-from fastrod_device.columns import EXTRA
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
+from fastrod_device.prototype import EXTRA
 from fastrod_device.readings import Trace
 from fastrod_device.safety import SafetyState
 

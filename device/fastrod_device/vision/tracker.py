@@ -37,11 +37,27 @@ from fastrod_device.vision.camera import (
     inverse,
 )
 from fastrod_device.vision.edges import SideFit, Sides
-from fastrod_device.vision.gates import TOO_FAST, TWICE, FrameOrder, Workspace
+from fastrod_device.vision.gates import (
+    AHEAD,
+    ASTRAY,
+    BACK,
+    FROZEN,
+    OUTSIDE,
+    REPEATED,
+    TOO_FAST,
+    TWICE,
+    FrameOrder,
+    Workspace,
+)
 
 if TYPE_CHECKING:
     import cv2
 
+FLAGS = (
+    *("", "no marker", "outlier", "ambiguous"),
+    *(FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD),
+)
+"""Flags of a sighting that may be wrong; a log has the place in this list, so new ones go to its end."""
 _CAP = 36.0
 _DECISIVE = 4.6  # twice the logarithm of a likelihood ratio of 10
 _ALIKE = math.radians(6.0)
@@ -59,7 +75,7 @@ class MarkerSighting:
     number: int
     """The frame's."""
     flag: str
-    """"" where it is to be trusted; else another of `columns.FLAGS`."""
+    """"" where it is to be trusted; else another of `FLAGS`."""
     position: Floats
     """(3,) of base_from_tip [m]."""
     quaternion: Floats
