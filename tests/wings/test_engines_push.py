@@ -42,6 +42,13 @@ def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(stage, dt, direction
 
 
 @pytest.mark.study
+def test_speed_of_a_free_cube_hardly_depends_on_the_step(stage):
+    fine, *coarse = (push(stage, dt, "side", gravity=0.0, duration=0.4)[0][-1] for dt in (0.001, 0.005, 0.01))
+    assert fine > 1.2 * SPEED
+    assert_allclose(coarse, fine, rtol=0.012)  # where the cube took steps of implicit Euler, 2.1 %
+
+
+@pytest.mark.study
 @pytest.mark.parametrize("direction", ["axial", "side"])
 def test_cube_on_the_floor_follows_the_tip(stage, direction):
     # from the side the rod bends by some 3 cm until 20 g slide; 100 g would bend it as far as it is long
