@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 
 import numba
@@ -56,13 +57,15 @@ def one_compilation() -> Iterator[None]:
     yield
     if numba.config.DISABLE_JIT:
         return
-    from fastrod.kernels import batch, contact_batch, modal_batch, press_batch
+    from fastrod.kernels import batch, contact_batch, press_batch
     from fastrod.kernels.jit import OnThreads
     from fastrod.kernels.rod import cold
 
     loops = {**vars(batch), **vars(contact_batch)}
     large = {name: loop.one for name, loop in loops.items() if isinstance(loop, OnThreads)}
     large |= {"move_to_inputs": batch.move_to_inputs, "begin": cold.begin}
-    large |= {"pass_modes": modal_batch.pass_modes, "derive_modes": modal_batch.derive_modes}
+    for lanes in ("", "narrow."):
+        modal = vars(import_module(f"fastrod.kernels.{lanes}modal_batch"))
+        large |= {f"{lanes}{name}": modal[name] for name in ("pass_modes", "derive_modes")}
     large |= {"press_some": press_batch.press_some}
     assert {name: len(one.signatures) for name, one in large.items() if len(one.signatures) > 1} == {}

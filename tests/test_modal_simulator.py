@@ -141,6 +141,22 @@ def test_a_batch_of_different_robots_is_as_many_single_ones(options: dict[str, A
             assert_same(state, (sim.settle if k == 0 else sim.step)(**own), i, 0)
 
 
+@BOTH
+def test_many_lanes_answer_as_few_do(options: dict[str, Any]) -> None:
+    robot = heavy()
+    few, many = simulator(robot, options), simulator(robot, options, 3 * N)
+    assert few._rods.modal._kernels is not many._rods.modal._kernels  # type: ignore[attr-defined]
+    for k in range(6):
+        given = inputs(robot, k)
+        thrice = {name: np.concatenate([a] * 3) for name, a in given.items()}
+        one, three = (
+            (sim.settle if k == 0 else sim.step)(**each) for sim, each in ((few, given), (many, thrice))
+        )
+        for name in ALL:
+            a, b = (getattr(state, name) for state in (one, three))
+            assert_allclose(b, np.concatenate([a] * 3), rtol=1e-12, atol=1e-12, err_msg=name)
+
+
 def test_a_batch_of_different_lumps_is_as_many_single_ones_to_rounding() -> None:
     robots = [heavy(lumps=(Lump(at=0.01 + 0.01 * i, mass=1e-3 * i),)) for i in range(N)]
     together, single = simulator(robots, MOVING), [simulator(robot, MOVING, 1) for robot in robots]

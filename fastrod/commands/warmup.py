@@ -63,17 +63,18 @@ def _contact() -> Iterator[None]:
 def _modes() -> Iterator[None]:
     """A rod of modes, and its derivatives."""
     robot = load_robot("prototype")
-    sim = Simulator(robot, points_per_segment=2, solver="modal")
-    sim.settle(robot.rest_tendon_length)
-    yield
-    sim.jacobian()
-    yield
+    for n in (1, _MANY):  # few lanes, and many
+        sim = Simulator(robot, n, points_per_segment=2, solver="modal")
+        sim.settle(robot.rest_tendon_length)
+        yield
+        sim.jacobian()
+        yield
 
 
 GROUPS: Mapping[str, tuple[Callable[[], Iterator[None]], int]] = {
     "rod": (_rod, 3),
     "contact": (_contact, 3),
-    "modes": (_modes, 2),
+    "modes": (_modes, 4),
 }
 """Kernels of each group, and its number of steps; contact also compiles what it needs of the others."""
 

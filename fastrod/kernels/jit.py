@@ -143,10 +143,10 @@ def kernel(function: _Function) -> _Function:
     return _inner(function, nogil=True)
 
 
-def entry(function: _Function) -> _Function:
-    """Compile what Python calls, on first call, and keep it across processes where a folder is writable. It
-    may make arrays."""
-    return _compile(function)
+def entry(function: _Function, folder: str | None = CACHE_DIR) -> _Function:
+    """Compile what Python calls, on first call, and keep it across processes in a `folder`, where there is
+    one. It may make arrays."""
+    return _compile(function, folder)
 
 
 def parallel_entry(function: _Function) -> _Function:

@@ -9,9 +9,11 @@ from fastrod.types import Floats
 from .jit import LANES, entry
 from .rod.modal.chunk import ModalRun, pass_of_modes
 from .rod.modal.derivatives import ModalDerivatives, derivatives_of_modes
-from .rod.modal.fields import ModalWork
+from .rod.modal.fields import ModalWork, modal_workspace
 from .rod.modal.gather import ModalBatch
 from .rod.modal.output import ModalOutput
+
+__all__ = ["LANES", "derive_modes", "modal_workspace", "pass_modes"]
 
 
 @entry

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypedDict
@@ -49,9 +50,7 @@ def load_robot(source: str | Path) -> Robot:
         )
     text = str(source)
     if text in robot_names():
-        return loads(
-            files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text
-        )
+        return _shipped(text)
     path = Path(source)
     try:
         unknown = path.suffix != ".toml" and not path.is_file()
@@ -65,6 +64,11 @@ def load_robot(source: str | Path) -> Robot:
         )
     content = read_text(path, f"robot file {shown(text)}", RobotError)
     return loads(content, text)
+
+
+@cache
+def _shipped(name: str) -> Robot:
+    return loads(files("fastrod").joinpath("robots").joinpath(f"{name}.toml").read_text("utf-8"), name)
 
 
 def loads(text: str, where: str = "robot file") -> Robot:

@@ -7,15 +7,14 @@ import os
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Literal, NamedTuple, get_args
+from importlib import import_module
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from fastrod.kernels.jit import LANES
-from fastrod.kernels.modal_batch import derive_modes, pass_modes
 from fastrod.kernels.rod.modal.chunk import ModalRun
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
-from fastrod.kernels.rod.modal.fields import ModalWork, modal_workspace
+from fastrod.kernels.rod.modal.fields import ModalWork
 from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.modes import (
@@ -38,9 +37,16 @@ from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
 _NOTHING = 1e-100
-_SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
+_SMALL = 4  # chunks: for so many, to start threads costs more than it saves
+_FEW, _LARGE = 8, 48  # robots, and unknowns of one: for so few, or for more of them, lanes are few
 _NEARLY = 0.05  # rad: a Newton step of this size leaves an error of its square
 _MOST = 200
+
+
+@cache
+def _kernels_of(narrow: bool) -> Any:
+    """`kernels.modal_batch`, of few lanes or of many; no type checker would find the former."""
+    return import_module(f"fastrod.kernels{'.narrow' if narrow else ''}.modal_batch")
 
 
 @cache
@@ -224,7 +230,12 @@ class ModalSolver:
         self.points = no_points(n_robots)
         self.host = no_hosts()
         """Bodies that give way to the rods in the next step."""
+        self._narrow = n_robots <= _FEW or n_q > _LARGE
         self._work: tuple[tuple[int, int], ModalWork] | None = None
+
+    @property
+    def _kernels(self) -> Any:
+        return _kernels_of(self._narrow)
 
     @property
     def n_points(self) -> int:
@@ -317,7 +328,9 @@ class ModalSolver:
         output = ModalOutput(self.samples, shape, moving)
 
         def run_some(some: Ints, work: ModalWork) -> None:
-            pass_modes(self._run_of(some, how, jump, effort, remembers, given, ends), batch, output, work)
+            self._kernels.pass_modes(
+                self._run_of(some, how, jump, effort, remembers, given, ends), batch, output, work
+            )
 
         self._distribute(rows, run_some)
         # of what fades away each pass leaves less, in the end numbers below the normal ones: with these a
@@ -371,8 +384,8 @@ class ModalSolver:
         return ModalRun(
             rows,
             np.zeros(self.n_robots) if jump is None else jump,
-            np.zeros((1, 4, self._sizes[1] * LANES)),
-            np.zeros((1, 2, LANES)),
+            np.zeros((1, 4, self._sizes[1] * self._kernels.LANES)),
+            np.zeros((1, 2, self._kernels.LANES)),
             self.iterations,
             how.scheme,
             float(how.dt),
@@ -433,16 +446,19 @@ class ModalSolver:
         batch = self._batch(ports, motion, host)
 
         def derive_some(some: Ints, work: ModalWork) -> None:
-            derive_modes(self._run_of(some, how, jump, (0.0, 1, 1), REST), batch, q, work, found)
+            self._kernels.derive_modes(
+                self._run_of(some, how, jump, (0.0, 1, 1), REST), batch, q, work, found
+            )
 
         self._distribute(rows, derive_some)
         return found
 
     def _distribute(self, rows: Ints, run: Callable[[Ints, ModalWork], None]) -> None:
         """Call `run` with some of the rows and a workspace for these, on so many threads."""
-        chunks = -(-len(rows) // LANES)
-        tasks = 1 if len(rows) <= _SMALL else min(self.threads, chunks)
-        each, room = LANES * -(-chunks // tasks), self._workspace(tasks)
+        lanes = self._kernels.LANES
+        chunks = -(-len(rows) // lanes)
+        tasks = 1 if chunks <= _SMALL else min(self.threads, chunks)
+        each, room = lanes * -(-chunks // tasks), self._workspace(tasks)
         in_threads(
             tasks, lambda k: run(rows[k * each : (k + 1) * each], ModalWork(*(a[k : k + 1] for a in room)))
         )
@@ -452,7 +468,7 @@ class ModalSolver:
         n_pieces, n_tendons, n_lumps = self._sizes
         size = tasks, n_lumps + self.points.piece.shape[1]
         if self._work is None or self._work[0] != size:
-            self._work = size, modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
+            self._work = size, self._kernels.modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
         return self._work[1]
 
     def place_points(self, points: tuple[Floats, ...], extension: Floats) -> None:
