@@ -123,6 +123,40 @@ def answers(presses: int) -> list[float]:
     return taken
 
 
+def pace(what: str, seconds: float) -> Row:
+    """Seconds of a scene in a second, and pictures, while its script plays for one page; its restarts left
+    out."""
+    from windows import Window
+
+    from fastrod_viewer.app import App
+
+    note_progress(f"pace, {what}")
+    seen: list[tuple[float, float]] = []
+    with browser() as chromium, App(port=0, say=lambda _: None) as app:
+        app.open(what, script=True)
+        window = Window(chromium)
+        window.go(app.address)
+        page: Any = app.page
+        draw = page.session._draw
+
+        def counted(frame: Any) -> None:
+            draw(frame)
+            seen.append((time.perf_counter(), page.world.t))
+
+        time.sleep(2.0)
+        page.session._draw = counted
+        time.sleep(seconds)
+        window.close()
+    taken, gone = np.diff(seen, axis=0).T
+    on = gone > 0.0
+    return {
+        "what": what,
+        "pace": float(gone[on].sum() / taken[on].sum()),
+        "pictures": float(1.0 / taken[on].mean()),
+        "late": 1e3 * float(np.quantile(taken[on], 0.95)),
+    }
+
+
 def load(what: str, seconds: float, port: int) -> float:
     note_progress(f"load, {what}")
     with shown(what, "--play", port=port) as (_, process, *_):
@@ -189,6 +223,13 @@ def measure(options: Any) -> list[Section]:
             "what | value:.3g measured | unit | target:g | met",
             [{"what": what, "value": x, "unit": unit, **goal(x, target)} for what, x, unit, target in rows],
             f"{len(taken)} key presses on a slider; {os.cpu_count()} cores.",
+        ),
+        table(
+            "pace",
+            "Scenes in contact that play for one page",
+            "what | pace:.2f s of the scene in a second | pictures:.0f pictures/s | late:.0f ms, 95 %",
+            [pace(what, seconds) for what in ("airway", "bar", "pair", "draped", "wall")],
+            "Chromium draws in software on the same cores.",
         ),
         table(
             "memory",

@@ -127,15 +127,15 @@ def _instrument() -> None:
     from fastrod.kernels import jit
 
     jit.LANES = 1
-    import fastrod.kernels as package
+    from fastrod.kernels import rod
     from fastrod.solver import boundary
     from fastrod.types import Memory, RodShape
 
-    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if ".contact" not in info.name:
-            held = vars(importlib.import_module(info.name))
-            held.update({name: _Math() for name, value in held.items() if value is math})
-            held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
+    rods = pkgutil.walk_packages(rod.__path__, rod.__name__ + ".")
+    for name in ("fastrod.kernels.batch", "fastrod.kernels.vec", *(info.name for info in rods)):
+        held = vars(importlib.import_module(name))
+        held.update({name: _Math() for name, value in held.items() if value is math})
+        held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
     body = vars(boundary)["pass_robots"]
 
     def counting(*arguments: Any) -> None:

@@ -64,8 +64,8 @@ def one_compilation() -> Iterator[None]:
     loops = {**vars(batch), **vars(contact_batch)}
     large = {name: loop.one for name, loop in loops.items() if isinstance(loop, OnThreads)}
     large |= {"move_to_inputs": batch.move_to_inputs, "begin": cold.begin}
-    for lanes in ("", "narrow."):
-        modal = vars(import_module(f"fastrod.kernels.{lanes}modal_batch"))
-        large |= {f"{lanes}{name}": modal[name] for name in ("pass_modes", "derive_modes")}
+    for lanes in ("kernels", "solver.narrow"):
+        modal = vars(import_module(f"fastrod.{lanes}.modal_batch"))
+        large |= {f"{lanes}.{name}": modal[name] for name in ("pass_modes", "derive_modes")}
     large |= {"press_some": press_batch.press_some}
     assert {name: len(one.signatures) for name, one in large.items() if len(one.signatures) > 1} == {}

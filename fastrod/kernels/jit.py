@@ -27,7 +27,7 @@ from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
 _register: Any = event.register  # it has no types
-_PLACE = "fastrod.kernels."
+_PLACE = "fastrod."
 SECONDS = {
     "pass_some": ("the rod", 40),
     "search_some": ("contact", 45),
@@ -239,9 +239,8 @@ def pointed(function: _Function, signature: Any, **options: bool) -> tuple[_Func
     kernels that call it need not be compiled again. Without the compiler a number that stands for it.
     `options` of numba's njit, such as nogil=False where Python is called."""
     function = getattr(function, "py_func", function)
-    compiled = (
-        function if _config.DISABLE_JIT else _compile(function, folder=_own_folder(function), **options)
-    )
+    folder = own_folder(getattr(sys.modules.get(function.__module__), "__file__", None))
+    compiled = function if _config.DISABLE_JIT else _compile(function, folder, **options)
     return compiled, _address_of(compiled, signature)
 
 
@@ -257,10 +256,8 @@ _POINTED: list[Any] = []
 """Compiled code stays where it is as long as somebody holds it."""
 
 
-def _own_folder(function: Callable[..., Any]) -> str | None:
-    """Return where the code of this function is kept: a folder for each state of the file that it stands
-    in."""
-    file = getattr(sys.modules.get(function.__module__), "__file__", None)
+def own_folder(file: str | None) -> str | None:
+    """Return where the code of functions in this file is kept: a folder for each state of it."""
     if CACHE_DIR is None or file is None:  # of a notebook
         return None
     source = Path(file)

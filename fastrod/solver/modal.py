@@ -46,7 +46,7 @@ _MOST = 200
 @cache
 def _kernels_of(narrow: bool) -> Any:
     """`kernels.modal_batch`, of few lanes or of many; no type checker would find the former."""
-    return import_module(f"fastrod.kernels{'.narrow' if narrow else ''}.modal_batch")
+    return import_module(f"fastrod.{'solver.narrow' if narrow else 'kernels'}.modal_batch")
 
 
 @cache

@@ -46,7 +46,7 @@ def test_a_moment_works_on_the_rotation_of_its_cross_section() -> None:
     assert_allclose(lower, np.tril(by_moment), atol=1e-6 * np.abs(by_moment).max())
 
     def gradient(q_new: Any) -> Any:
-        """Of the energy with forces on arms that have turned by the way, to second order."""
+        """Gradient of the energy with forces on arms that have turned by the way, to second order."""
         found = at(q_new, force)
         by = np.einsum("kfa,a->kf", 0.5 * (found.point_rotation[0] + turn), (q_new - q)[0])
         now = arm[0] + np.cross(by, arm[0] + 0.5 * np.cross(by, arm[0]))
