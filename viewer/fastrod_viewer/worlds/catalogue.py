@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ROD_SCENES: Mapping[str, str] = {
     "airway": "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into "
     "the right one.",
-    "bar": "The five-segment reacher closes around a bar and grips it.",
+    "bar": "A thin robot winds itself around a bar of 30 mm and holds it.",
     "draped": "A cylinder rises under a heavy, sagging rod, which drapes itself over it.",
     "grid": "Sixty-four five-segment reachers sway in waves, each with a phase of its own, in one simulator.",
     "insertion": "A soft, bent tip is pushed through a ribbed tube: every rib holds it until it jumps over.",
