@@ -38,7 +38,7 @@ from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
 _NOTHING = 1e-100
 _SMALL = 4  # chunks: for so many, to start threads costs more than it saves
-_FEW, _LARGE = 8, 48  # robots, and unknowns of one: for so few, or for more of them, lanes are few
+_FEW, _LARGE = 8, 64  # robots, and unknowns of one: for so few, or for more of them, lanes are few
 _NEARLY = 0.05  # rad: a Newton step of this size leaves an error of its square
 _MOST = 200
 
