@@ -211,6 +211,21 @@ def test_a_robot_that_is_hard_to_solve_leaves_its_neighbours_alone() -> None:
         assert_same(state, other, rest)
 
 
+def test_lengths_with_noise_take_one_newton_step_as_smooth_ones_do() -> None:
+    robot, rng, pulled = heavy(), np.random.default_rng(0), bend(heavy(), 0.2, 0.1)
+    loose, tight = (simulator(robot, MOVING, 64) for _ in range(2))
+    rest = np.tile(pulled, (64, 1))
+    for sim in (loose, tight):
+        assert sim.settle(tendon_length=rest).ok.all()
+    taken = []
+    for _ in range(20):
+        now = rest + 5e-5 * rng.normal(size=rest.shape)
+        state, exact = loose.step(tendon_length=now), tight.step(tendon_length=now, passes=3)
+        assert_allclose(state.tip_position, exact.tip_position, atol=1e-4 * robot.length)
+        taken.append(state.passes)
+    assert np.mean(taken) < 1.1
+
+
 def test_one_bad_row_leaves_its_neighbours_alone() -> None:
     sim, clean = begun(MOVING, heavy()), begun(MOVING, heavy())
     given = inputs(heavy(), 4)

@@ -39,7 +39,7 @@ SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZE
 _NOTHING = 1e-100
 _SMALL = 4  # chunks: for so many, to start threads costs more than it saves
 _FEW, _LARGE = 8, 64  # robots, and unknowns of one: for so few, or for more of them, lanes are few
-_NEARLY = 0.05  # rad: a Newton step of this size leaves an error of its square
+_NEARLY = 0.05  # rad of one piece: a Newton step of this size leaves an error of its square
 _MOST = 200
 
 
@@ -223,13 +223,14 @@ class ModalSolver:
         )
         n_q = n_pieces * len(self.basis.component)
         numbers = n_pieces * ((n + 1) * NODE_VECTORS + 3 * self._sizes[2])
-        self.motion = ModalMotion(
-            *(np.zeros((n_robots, n_q)) for _ in range(3)), *(np.zeros((n_robots, numbers)) for _ in range(4))
-        )
+        unknowns = (np.zeros((n_robots, n_q)) for _ in range(3))
+        inert = (np.zeros((n_robots, numbers)) for _ in range(4))
+        self.motion = ModalMotion._make([*unknowns, *inert, np.ones(n_robots)])
         self.iterations = np.zeros(n_robots, np.int64)
         self.points = no_points(n_robots)
         self.host = no_hosts()
         """Bodies that give way to the rods in the next step."""
+        self._nearly = _NEARLY / math.sqrt(n_pieces)  # at the tip the errors of pieces add up
         self._narrow = n_robots <= _FEW or n_q > _LARGE
         self._work: tuple[tuple[int, int], ModalWork] | None = None
 
@@ -294,7 +295,7 @@ class ModalSolver:
         are not those that the last motion was leading to."""
         # those side by side that take one step more, for a chunk takes as many as its slowest robot
         order = rows[np.argsort(-jump[rows], kind="stable")] if jump.any() else rows
-        self._run(order, ports, shape, moving, how, jump, (_NEARLY, how.passes, _MOST), how.scheme)
+        self._run(order, ports, shape, moving, how, jump, (self._nearly, how.passes, _MOST), how.scheme)
         return np.asarray(self.iterations[rows] > 0)
 
     def hold(
@@ -309,7 +310,7 @@ class ModalSolver:
     ) -> None:
         """Show these robots at `unknowns` (n_robots, n_q, six more where bases give way) a step further;
         where it `ends` there, they go on from it."""
-        self._run(rows, ports, shape, moving, how, None, (_NEARLY, 1, 1), how.scheme, unknowns, ends)
+        self._run(rows, ports, shape, moving, how, None, (self._nearly, 1, 1), how.scheme, unknowns, ends)
 
     def _run(
         self,
