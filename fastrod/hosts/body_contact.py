@@ -46,6 +46,8 @@ class BodyContact(ABC):
     The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping
     would swing with what it pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body
     is expected where tau dF of the last force has been taken off.
+
+    After a step in which the rod's forces are not known it only stops the body, until that takes all it has.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class BodyContact(ABC):
         """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step,
         world."""
         self._before: Floats = np.zeros(6)
+        self._lost = False  # the rod's forces of the last step were not known
         self._even = False  # the last force was like the one before it
         self._weight, self._past = 1.0, np.zeros(6)  # of the coming force, and of those before it
 
@@ -146,6 +149,10 @@ class BodyContact(ABC):
         along = wrench[:3] if wrench[:3].any() else self._before[:3]
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
+        if self._lost:
+            stopping = self._stopping(wrench + more)
+            self._lost = bool((stopping != wrench + more).any())
+            more = stopping - wrench
         even = bool(np.linalg.norm(wrench - self._before) < _ALIKE * np.linalg.norm(wrench))
         if even and self._even:
             felt = _FELT if self._weight == 1.0 else 0.0
@@ -159,15 +166,26 @@ class BodyContact(ABC):
     @final
     def push_half(self) -> None:
         """Exert half of the last forces: for a step in which the rod's are not known."""
-        self._before, self.exerted = 0.5 * self._before, 0.5 * self.exerted
+        self._before, self.exerted, self._lost = 0.5 * self._before, 0.5 * self.exerted, True
         self._begin_anew()
         self._exert()
 
     @final
     def forget(self) -> None:
         """The body was put somewhere else: no force carries over."""
-        self._before, self.exerted = np.zeros(6), np.zeros(6)
+        self._before, self.exerted, self._lost = np.zeros(6), np.zeros(6), False
         self._begin_anew()
+
+    def _stopping(self, wrench: Floats) -> Floats:
+        """No more of a wrench than stops the body: while its rod was lost it went into it, against no force,
+        and what the rod would give it is nobody's energy."""
+        motion = self.com()
+        rotation = matrix_from_quaternion(motion.pose[None, 3:])[0]
+        gained = np.concatenate(
+            [wrench[:3] / self.mass, rotation @ (rotation.T @ wrench[3:] / self._inertia)]
+        )
+        power, slows = float(wrench @ gained), float(-wrench @ motion.velocity)
+        return wrench * min(1.0, max(slows, 0.0) / max(self.dt * power, 1e-300))
 
     def _begin_anew(self, even: bool = False) -> None:
         """Let the body feel the coming force alone; the last one was like the one before it, if `even`."""

@@ -29,6 +29,7 @@ from .fields import (
     N_N,
     N_POS,
     N_R,
+    N_ROTARY,
     N_T,
     P_L,
     P_RHO,
@@ -113,20 +114,28 @@ def moments_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork, mom
         for w in range(W):
             grown = cross(get(here, C_V, w), get(node, N_N, w))
             grown = add(grown, cross(get(node, N_T, w), get(force, 0, w)))
+            grown = add(grown, mul(get_mat(node, N_ROTARY, w), get(here, C_TH, w)))
             put(moment, 0, w, add(get(moment, 0, w), grown))
-        rotary_by_column(p, j, here, work, moment)
 
 
 @kernel
-def rotary_by_column(p: int, j: int, column: Lanes, work: ModalWork, moment: Lanes) -> None:
-    """Add the change of - alpha J d x d~ at a node by its rotation."""
-    node, history = work.node[p, j], work.history[p, j]
-    for k in range(3):
+def rotary_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
+    """Change of - alpha J d x d~ at the nodes by a rotation th: (th x d) x d~ = d (th . d~) - th (d . d~)."""
+    for j in range(b.node.shape[0]):
+        node, history = work.node[p, j], work.history[p, j]
         for w in range(W):
-            factor, th = -work.scheme[w] * read(history, H_J + k, w), get(column, C_TH, w)
-            d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
-            turned = cross(cross(th, d), get(history, H_D + 3 * k, w))
-            put(moment, 0, w, axpy(factor, turned, get(moment, 0, w)))
+            for f in range(9):
+                write(node, N_ROTARY + f, w, 0.0)
+        for k in range(3):
+            for w in range(W):
+                factor, h = -work.scheme[w] * read(history, H_J + k, w), get(history, H_D + 3 * k, w)
+                d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
+                both = factor * dot(d, h)
+                for r in range(3):
+                    moved = axpy(factor * d[r], h, get(node, N_ROTARY + 3 * r, w))
+                    put(node, N_ROTARY + 3 * r, w, moved)
+                    diagonal = N_ROTARY + 4 * r
+                    write(node, diagonal, w, read(node, diagonal, w) - both)
 
 
 @kernel
@@ -163,13 +172,13 @@ def own_block(p: int, b: ModalBasis, work: ModalWork, moment: Lanes, out: Lanes)
     n_modes = b.component.shape[0]
     for c in range(n_modes):
         column_of_piece(p, work.column[p, c], b, work, moment)
+        if b.component[c] < 3:
+            add_local(p, c, b, work)
         for a in range(c, n_modes):
             work_of_column(p, a, work.column[p, c], b, work, out)
             row, col = p * n_modes + a, p * n_modes + c
             for w in range(W):
                 write_at(hessian(work), row, col, w, at(hessian(work), row, col, w) + out[w])
-            if b.component[a] < 3:
-                add_local(p, a, c, b, work)
 
 
 @kernel
@@ -265,16 +274,20 @@ def coupling_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
 
 
 @kernel
-def add_tendons(work: ModalWork) -> None:
-    """Add (1 / c) dl dl^T of every tendon that is taut."""
+def add_tendons(first_tendon: Ints, work: ModalWork, pull: Lanes) -> None:
+    """Add (1 / c) dl dl^T of every tendon that is taut; those before `first_tendon` of a piece end before
+    it."""
     n_q = len(work.q) // W
-    for t in range(len(work.tension) // W):
-        stiffness = work.stiffness[t * W :]
-        for a in range(n_q):
+    n_modes = n_q // work.piece.shape[0]
+    for a in range(n_q):
+        row = hessian(work).entries[a * n_q * W : (a * n_q + a + 1) * W]
+        for t in range(first_tendon[a // n_modes], len(work.tension) // W):
+            change = path_change(work).entries[t * n_q * W : (t * n_q + a + 1) * W]
+            for w in range(W):
+                pull[w] = work.stiffness[t * W + w] * read(change, a, w)
             for c in range(a + 1):
                 for w in range(W):
-                    both = at(path_change(work), t, a, w) * at(path_change(work), t, c, w)
-                    write_at(hessian(work), a, c, w, at(hessian(work), a, c, w) + stiffness[w] * both)
+                    write(row, c, w, read(row, c, w) + pull[w] * read(change, c, w))
 
 
 @kernel
@@ -288,6 +301,7 @@ def assemble(b: ModalBasis, first_tendon: Ints, work: ModalWork) -> None:
         p = n_pieces - 1 - step
         balance_of_piece(p, b, work)
         local_of_piece(p, b, work)
+        rotary_of_piece(p, b, work)
         tendon_stiffness_of_piece(p, first_tendon[p], b, work)
         own_block(p, b, work, moment, out)
         rotations_of_piece(p, b, work, moment, out)
@@ -299,4 +313,4 @@ def assemble(b: ModalBasis, first_tendon: Ints, work: ModalWork) -> None:
         for i in range(BEYOND * W):
             work.beyond[0, i] = work.beyond[1, i]
         add_elasticity(p, b, work)
-    add_tendons(work)
+    add_tendons(first_tendon, work, out)

@@ -14,9 +14,23 @@ generalized-alpha at 1 ms)."""
 
 
 @kernel
+def subtract_products(to: Lanes, x: Lanes, y: Lanes, n: int) -> None:
+    """to -= sum of x_k y_k, four at a time: `to` is read and written a quarter as often."""
+    for k in range(0, n - 3, 4):
+        u, v = x[k * W : (k + 4) * W], y[k * W : (k + 4) * W]
+        for w in range(W):
+            four = u[w] * v[w] + u[W + w] * v[W + w]
+            four += u[2 * W + w] * v[2 * W + w] + u[3 * W + w] * v[3 * W + w]
+            to[w] -= four
+    for k in range(n - n % 4, n):
+        for w in range(W):
+            to[w] -= x[k * W + w] * y[k * W + w]
+
+
+@kernel
 def factor(m: LaneMatrix, replaced: Lanes) -> None:
     """L of M = L L^T in place of the lower triangle, the inverse of its diagonal on the diagonal; `replaced`
-    (1,) counts the pivots for which a diagonal entry had to stand."""
+    (2,) counts the pivots for which a diagonal entry had to stand; its second row is room for one."""
     a, n = m.entries, m.n_columns
     row = n * W
     for w in range(W):
@@ -24,18 +38,16 @@ def factor(m: LaneMatrix, replaced: Lanes) -> None:
     for j in range(n):
         pivot = a[j * row + j * W : j * row + (j + 1) * W]
         for w in range(W):
-            left = pivot[w]
-            for k in range(j):
-                left -= a[j * row + k * W + w] * a[j * row + k * W + w]
-            bad = not left > PIVOT * abs(pivot[w])
+            replaced[W + w] = abs(pivot[w])
+        subtract_products(pivot, a[j * row :], a[j * row :], j)
+        for w in range(W):
+            whole, left = replaced[W + w], pivot[w]
+            bad = not left > PIVOT * whole
             replaced[w] += 1.0 if bad else 0.0
-            pivot[w] = 1.0 / math.sqrt(max(abs(pivot[w]), 1e-300) if bad else left)
+            pivot[w] = 1.0 / math.sqrt(max(whole, 1e-300) if bad else left)
         for i in range(j + 1, n):
             to = a[i * row + j * W : i * row + (j + 1) * W]
-            for k in range(j):
-                left_k, right_k = a[i * row + k * W :], a[j * row + k * W :]
-                for w in range(W):
-                    to[w] -= left_k[w] * right_k[w]
+            subtract_products(to, a[i * row :], a[j * row :], j)
             for w in range(W):
                 to[w] *= pivot[w]
 

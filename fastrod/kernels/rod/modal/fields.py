@@ -15,8 +15,8 @@ from ..lanes import LaneMatrix, Lanes, W
 from .modes import ModalBasis
 
 # node: rotation, position, tangent t = R v, force and moment that it must be given, force that its tangent
-# carries into the positions beyond, moment t x N + C
-N_R, N_POS, N_T, N_F, N_C, N_N, N_MU, NODE = 0, 9, 12, 15, 18, 21, 24, 27
+# carries into the positions beyond, moment t x N + C, change of C by a rotation (3, 3)
+N_R, N_POS, N_T, N_F, N_C, N_N, N_MU, N_ROTARY, NODE = 0, 9, 12, 15, 18, 21, 24, 27, 36
 # given at a node: what its inertia is counted from, position and directors (`motion`), the line force
 # there, the masses of the directors that stand for its rotary inertia [kg m^2], the two parts of the line
 # force: that of the world, and the one that follows the rod, material; and a moment
@@ -39,10 +39,10 @@ C_TH, C_V, COLUMN = 0, 3, 6
 # counted from, force from outside; its row of the integration follows
 S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
 # Newton: energies of the trial and before it, damping, size [rad] of the step at work and of the robot's last
-# one, fraction of it that is taken, flags, the tip's rotation before it, how many steps the robot took, and
-# which tendons were slack before the step
+# one, fraction of it that is taken, flags, a diagonal entry of the Hessian, the tip's rotation before the
+# step, how many steps the robot took, and which tendons were slack before the step
 L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
-L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 17, 18, 19, 20
+L_PIVOT, L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 9, 18, 19, 20, 21
 
 # host: 1 where a base gives way, 1 in the first lane where any does; displacement of the base and its Newton
 # step; inertia of its body over kappa dt^2 (6, 6), its pose without the rod, kappa, the mean of the rod's

@@ -317,7 +317,7 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
             if not on:  # a base whose motion is prescribed
                 write(right, r, w, 0.0)
                 write_at(matrix, r, r, w, 1e300)
-    factor(matrix, work.scratch[6 * W : 7 * W])
+    factor(matrix, work.scratch[6 * W : 8 * W])
     solve(matrix, right)
     for k in range(6):
         for w in range(W):

@@ -13,7 +13,7 @@ from __future__ import annotations
 from ...jit import inline, kernel
 from ...vec import Sym, Vec, axpy, cross, dot, mul_t, scale, sym_mul
 from ..lanes import Lanes, W, at, get, get_mat, read, write, write_at
-from .fields import I_DK, I_LOCAL, I_M, I_O, I_U, N_R, P_K, P_L, P_TAU, P_UNEVEN, ModalWork, hessian
+from .fields import I_DK, I_LOCAL, I_M, I_O, I_U, I_WORK, N_R, P_K, P_L, P_TAU, P_UNEVEN, ModalWork, hessian
 from .modes import ModalBasis
 from .sweep import MAGNUS, exp_series, rotation_vector_changes
 from .tendons import entry
@@ -93,20 +93,16 @@ def local_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
 
 
 @kernel
-def add_local(p: int, a: int, c: int, b: ModalBasis, work: ModalWork) -> None:
-    """Add to the Hessian of two modes of curvature of a piece what the intervals have by themselves."""
-    n_modes, ca, cc = b.component.shape[0], b.component[a], b.component[c]
-    row, col = p * n_modes + a, p * n_modes + c
-    both = (I_LOCAL + entry(ca, cc), I_LOCAL + entry(3 + ca, 3 + cc))
-    mixed = (I_LOCAL + entry(3 + ca, cc), I_LOCAL + entry(3 + cc, ca))
+def add_local(p: int, a: int, b: ModalBasis, work: ModalWork) -> None:
+    """Add to the work of a column, of a mode of curvature, what the intervals have by themselves."""
+    c, m = b.component[a], b.degree[a]
     for i in range(b.width.shape[0]):
-        here = work.interval[p, i]
-        a1, a2 = b.at_gauss[i, 0, b.degree[a]], b.at_gauss[i, 1, b.degree[a]]
-        c1, c2 = b.at_gauss[i, 0, b.degree[c]], b.at_gauss[i, 1, b.degree[c]]
-        for w in range(W):
-            own = a1 * c1 * read(here, both[0], w) + a2 * c2 * read(here, both[1], w)
-            own += a2 * c1 * read(here, mixed[0], w) + a1 * c2 * read(here, mixed[1], w)
-            write_at(hessian(work), row, col, w, at(hessian(work), row, col, w) + own)
+        here, b1, b2 = work.interval[p, i], b.at_gauss[i, 0, m], b.at_gauss[i, 1, m]
+        for f in range(6):
+            first, second, to = I_LOCAL + entry(f, c), I_LOCAL + entry(f, 3 + c), I_WORK + f
+            for w in range(W):
+                own = b1 * read(here, first, w) + b2 * read(here, second, w)
+                write(here, to, w, read(here, to, w) + own)
 
 
 @kernel

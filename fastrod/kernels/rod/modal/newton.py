@@ -229,7 +229,7 @@ def minimise(
         follows = on_tip or work.piece[0, P_FOLLOWED * W] > 0.0
         assemble(b, first_tendon, work)
         add_damping(b, work)
-        factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 1) * W])
+        factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 2) * W])
         forward(hessian(work), work.gradient)
         if hosted(work):
             base_step(robots, host, b, motion, work)

@@ -97,8 +97,9 @@ def curvature_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
 
 
 @kernel
-def march_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
-    """Rotation and tangent of the nodes, and the rotation of each interval's end by its curvatures."""
+def march_piece(p: int, b: ModalBasis, work: ModalWork, with_columns: bool) -> None:
+    """Rotation and tangent of the nodes, and `with_columns` the rotation of each interval's end by its
+    curvatures."""
     node, piece = work.node[p], work.piece[p]
     start = node[0]
     for w in range(W):
@@ -112,8 +113,16 @@ def march_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
             o = axpy(k, cross(u1, u2), scale(half, add(u1, u2)))
             series, _ = exp_series(o)
             r = get_mat(here, N_R, w)
-            x, y, z = rotation_vector_changes(u2, half, k)
             put(at, I_O, w, o)
+            new = matmul(r, rotation_of(o, series))
+            put_mat(to, N_R, w, new)
+            put(to, N_T, w, mul(new, get(to, N_T, w)))
+        for w in range(W if with_columns else 0):
+            h = width * read(piece, P_L, w)
+            half, k = 0.5 * h, MAGNUS * h * h
+            u1, u2, o = get(at, I_U, w), get(at, I_U + 3, w), get(at, I_O, w)
+            r, series = get_mat(here, N_R, w), exp_series(o)[0]
+            x, y, z = rotation_vector_changes(u2, half, k)
             put(at, I_W, w, mul(r, left_jacobian(o, series, x)))
             put(at, I_W + 3, w, mul(r, left_jacobian(o, series, y)))
             put(at, I_W + 6, w, mul(r, left_jacobian(o, series, z)))
@@ -121,9 +130,6 @@ def march_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
             put(at, I_W + 9, w, mul(r, left_jacobian(o, series, x)))
             put(at, I_W + 12, w, mul(r, left_jacobian(o, series, y)))
             put(at, I_W + 15, w, mul(r, left_jacobian(o, series, z)))
-            new = matmul(r, rotation_of(o, series))
-            put_mat(to, N_R, w, new)
-            put(to, N_T, w, mul(new, get(to, N_T, w)))
 
 
 @kernel
@@ -211,7 +217,7 @@ def sweep_piece(p: int, b: ModalBasis, work: ModalWork, with_columns: bool) -> N
     """Shape of a piece, and with `with_columns` its motion by every mode."""
     start_piece(p, b, work)
     curvature_of_piece(p, b, work)
-    march_piece(p, b, work)
+    march_piece(p, b, work, with_columns)
     positions_of_piece(p, b, work)
     if with_columns:
         for a in range(b.component.shape[0]):

@@ -22,10 +22,16 @@ ROUNDED = 5e-4
 
 
 @inline
-def path(u: Vec, v: Vec, x: float, y: float) -> tuple[float, Vec, float]:
-    """|q|, t and 1 / |q| of a tendon at d = (x, y)."""
+def growth(u: Vec, v: Vec, x: float, y: float) -> tuple[Vec, float]:
+    """q of a tendon at d = (x, y), and |q|^2 + e^2."""
     q = (v[0] - u[2] * y, v[1] + u[2] * x, v[2] + u[0] * y - u[1] * x)
-    square = dot(q, q) + ROUNDED * ROUNDED
+    return q, dot(q, q) + ROUNDED * ROUNDED
+
+
+@inline
+def path(u: Vec, v: Vec, x: float, y: float) -> tuple[float, Vec, float]:
+    """|q|, t and 1 / |q|."""
+    q, square = growth(u, v, x, y)
     inverse = 1.0 / math.sqrt(square)
     return square * inverse - 0.5 * ROUNDED * ROUNDED, scale(inverse, q), inverse
 
@@ -44,7 +50,12 @@ def add_paths(p: int, t: int, b: ModalBasis, work: ModalWork, with_columns: bool
     for i in range(b.width.shape[0]):
         here, width = work.interval[p, i], 0.5 * b.width[i]
         for g in range(2):
-            for w in range(W):
+            for w in range(0 if with_columns else W):  # without a division
+                half, x, y = width * read(work.piece[p], P_L, w), read(offset, 0, w), read(offset, 1, w)
+                _, square = growth(get(here, I_U + 3 * g, w), get(here, I_V + 3 * g, w), x, y)
+                size = math.sqrt(square) - 0.5 * ROUNDED * ROUNDED
+                write(work.path_length, t, w, read(work.path_length, t, w) + half * size)
+            for w in range(W if with_columns else 0):
                 half, x, y = width * read(work.piece[p], P_L, w), read(offset, 0, w), read(offset, 1, w)
                 size, d, _ = path(get(here, I_U + 3 * g, w), get(here, I_V + 3 * g, w), x, y)
                 write(work.path_length, t, w, read(work.path_length, t, w) + half * size)
@@ -75,10 +86,10 @@ def _add(sums: Lanes, f: int, w: int, value: float) -> None:
 
 @kernel
 def add_second_derivatives(
-    here: Lanes, half: Lanes, offset: Lanes, tension: Lanes, g: int, sums: Lanes
+    here: Lanes, half: Lanes, offset: Lanes, tension: Lanes, g: int, sums: Lanes, strained: bool
 ) -> None:
-    """Add T h/2 times the second derivative of one tendon's |q| by u and v at Gauss point g: (6, 6), lower
-    triangle. `half` (1,)."""
+    """Add T h/2 times the second derivative of one tendon's |q| by u, and if `strained` by v, at Gauss point
+    g: (6, 6), lower triangle. `half` (1,)."""
     for w in range(W):
         x, y = read(offset, 0, w), read(offset, 1, w)
         _, d, inverse = path(get(here, I_U + 3 * g, w), get(here, I_V + 3 * g, w), x, y)
@@ -91,6 +102,11 @@ def add_second_derivatives(
         _add(sums, 3, w, -k * a * f)
         _add(sums, 4, w, -k * e * f)
         _add(sums, 5, w, k * (x * x + y * y - f * f))
+    for w in range(W if strained else 0):
+        x, y = read(offset, 0, w), read(offset, 1, w)
+        _, d, inverse = path(get(here, I_U + 3 * g, w), get(here, I_V + 3 * g, w), x, y)
+        k = half[w] * tension[w] * inverse
+        a, e, f = y * d[2], -x * d[2], x * d[1] - y * d[0]
         _add(sums, 6, w, -k * a * d[0])
         _add(sums, 7, w, -k * e * d[0])
         _add(sums, 8, w, -k * (y + f * d[0]))
@@ -123,9 +139,8 @@ def tendon_stiffness_of_piece(p: int, first: int, b: ModalBasis, work: ModalWork
         for g in range(2):
             clear(sums)
             for t in range(first, len(work.path_length) // W):
-                add_second_derivatives(
-                    here, half, work.offset[p, 2 * t * W :], work.tension[t * W :], g, sums
-                )
+                offset, tension = work.offset[p, 2 * t * W :], work.tension[t * W :]
+                add_second_derivatives(here, half, offset, tension, g, sums, n_bent < n_modes)
             for r in range(3):
                 for c in range(r + 1):
                     field = I_LOCAL + entry(3 * g + r, 3 * g + c)
