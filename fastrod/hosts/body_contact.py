@@ -149,10 +149,9 @@ class BodyContact(ABC):
         along = wrench[:3] if wrench[:3].any() else self._before[:3]
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
-        if self._lost:
-            stopping = self._stopping(wrench + more)
-            self._lost = bool((stopping != wrench + more).any())
-            more = stopping - wrench
+        fraction = self._stopping(wrench + more) if self._lost else 1.0
+        more += (fraction - 1.0) * (wrench + more)
+        self._lost = fraction < 1.0 and bool(wrench.any())
         even = bool(np.linalg.norm(wrench - self._before) < _ALIKE * np.linalg.norm(wrench))
         if even and self._even:
             felt = _FELT if self._weight == 1.0 else 0.0
@@ -176,16 +175,13 @@ class BodyContact(ABC):
         self._before, self.exerted, self._lost = np.zeros(6), np.zeros(6), False
         self._begin_anew()
 
-    def _stopping(self, wrench: Floats) -> Floats:
-        """No more of a wrench than stops the body: while its rod was lost it went into it, against no force,
-        and what the rod would give it is nobody's energy."""
+    def _stopping(self, wrench: Floats) -> float:
+        """Fraction of a wrench that stops the body, at most all: while its rod was lost it went into it,
+        against no force, and what the rod would give it is nobody's energy."""
         motion = self.com()
-        rotation = matrix_from_quaternion(motion.pose[None, 3:])[0]
-        gained = np.concatenate(
-            [wrench[:3] / self.mass, rotation @ (rotation.T @ wrench[3:] / self._inertia)]
-        )
-        power, slows = float(wrench @ gained), float(-wrench @ motion.velocity)
-        return wrench * min(1.0, max(slows, 0.0) / max(self.dt * power, 1e-300))
+        moment = matrix_from_quaternion(motion.pose[None, 3:])[0].T @ wrench[3:]
+        power = wrench[:3] @ wrench[:3] / self.mass + moment @ (moment / self._inertia)
+        return float(min(1.0, max(-wrench @ motion.velocity, 0.0) / max(self.dt * power, 1e-300)))
 
     def _begin_anew(self, even: bool = False) -> None:
         """Let the body feel the coming force alone; the last one was like the one before it, if `even`."""
