@@ -41,8 +41,9 @@ class ModalMotion(NamedTuple):
     velocity_other: Floats
     """(n_robots, n) BDF2: velocity one step before; generalized-alpha: the acceleration."""
     lead: Floats
-    """(n_robots,) how much of its rate the last step followed, 0 to 1: the next one is looked for there. Of
-    inputs with noise, which the rate multiplies by 3.4 (BDF2) and no step repeats, it is near 0."""
+    """(n_robots,) how much of its rate the last step followed, 1 if it was more than half: the next one is
+    looked for there. Of inputs with noise, which the rate multiplies by 3.4 (BDF2) and no step repeats, it is
+    near 0."""
 
 
 class Scheme(NamedTuple):
@@ -200,7 +201,7 @@ def node_number(node: Lanes, f: int, w: int) -> float:
 @kernel
 def end_step(w: int, i: int, motion: ModalMotion, each: Scheme, jump: float, work: ModalWork) -> None:
     """Remember the shape of lane w, robot i, as that of the new time."""
-    m, s, along, whole = 0, scheme_of(each, jump), 0.0, 1e-300
+    m, s, along, whole = 0, scheme_of(each, jump), 1e-300, 1e-300
     for a in range(motion.q.shape[1]):
         before = motion.q[i, a]
         q, rate, other, _ = moved_on(
@@ -222,7 +223,7 @@ def end_step(w: int, i: int, motion: ModalMotion, each: Scheme, jump: float, wor
             for f in range(3):
                 _move(each.kind, s, motion, i, m, read(work.station[p, k], S_POS + f, w))
                 m += 1
-    motion.lead[i] = min(max(along / whole, 0.0), 1.0)
+    motion.lead[i] = 1.0 if along > 0.5 * whole else max(along / whole, 0.0)
 
 
 @kernel
