@@ -209,7 +209,11 @@ def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:
 
 
 def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
-    """All that follows from what a search has found."""
+    """All that follows from what a search has found, and data held out confirm."""
+    explained = explain(log, base, outcome)
+    if explained.in_vain(base.noise.floor):
+        outcome = _nothing_found(base, outcome)
+        explained = explain(log, base, outcome)
     remaining = residual_structure(
         base.search.samples,
         base.start.model.wiring,
@@ -218,7 +222,6 @@ def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
         correlation=base.search.row_correlation,
         doubt=base.noise.uncertainty,
     )
-    explained = explain(log, base, outcome)
     base = replace(base, noise=base.noise.below(explained.train_error.after))
     again = visits(log.samples, explained.start.model, explained.start.theta)
     remaining = remaining.with_memory(again.compare(explained.after))
@@ -392,6 +395,15 @@ def _candidates(
         steps=tuple(steps),
         notes=tuple(notes),
     )
+
+
+def _nothing_found(base: BaseFit, outcome: SearchOutcome) -> SearchOutcome:
+    """The outcome without what was found."""
+    first, why = outcome.steps[0], "data held out do not gain what the fitted ones do"
+    tried = tuple(replace(c, why=why) if c.name in outcome.names else c for c in first.candidates)
+    none = replace(first, candidates=tried, taken=None, rivals=())
+    start = outcome.start
+    return replace(outcome, search=base.search, last=start, state=start, names=(), steps=(none,))
 
 
 def _stopped(stages: int, seconds: float) -> str:

@@ -20,6 +20,7 @@ from fastrod.identification.report import report
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Result
+from fastrod.identification.search import search
 from fastrod.identification.search.base import fit_base
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robotfile import load_robot
@@ -28,12 +29,12 @@ SEED, RATE = 1000, 10.0
 
 
 @cache
-def sealed(effect: str) -> RunLog:
-    log = excitation(load_robot("prototype"), seed=SEED, rate=RATE).log
+def sealed(effect: str, seed: int = SEED) -> RunLog:
+    log = excitation(load_robot("prototype"), seed=seed, rate=RATE).log
     assert log.payload is not None
     assert log.base_quaternion is not None
     inputs = plant.Inputs(log.t, log.dl, log.payload, log.base_quaternion)
-    return replace(log, tip_position=plant.measure(inputs, plant.draw(SEED, effect)))
+    return replace(log, tip_position=plant.measure(inputs, plant.draw(seed, effect)))
 
 
 @cache
@@ -70,6 +71,21 @@ def test_the_share_above_the_noise_is_that_of_what_is_left() -> None:
     assert_allclose(result.above_noise, 1.0 - (result.noise.floor / result.test.after) ** 2)
     assert found("none").above_noise == 0.0
     assert report.to_json(result)["remaining"]["above_noise"] == result.above_noise
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [1000, 1009])
+def test_what_data_held_out_do_not_gain_from_is_no_finding(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a log of noise alone, by a search that takes nearly anything."""
+    for name, least in {"Z_ACCEPT": 0.5, "BIC_ACCEPT": -30.0, "FRACTION_ACCEPT": 1e-4}.items():
+        monkeypatch.setattr(search, name, least)
+    result = identify(sealed("none", seed), load_robot("prototype"), threads=1)
+    assert result.verdict == "none"
+    assert not result.effects
+    assert result.test.after == result.test.before
+    assert [t.name for t in result.tried if t.why.startswith("data held out do not gain")]
 
 
 @pytest.mark.study

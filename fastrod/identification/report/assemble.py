@@ -43,6 +43,7 @@ _DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
 _NEAR = 1.1  # of the noise: a held-out error within it is explained
+_CONFIRMS = 0.25  # of the gain on fitted data, on those held out: an effect of less is the noise's
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 # of the error above the noise: where so much is left, shear and inertia are worth a sentence
@@ -77,6 +78,14 @@ class Explained:
     """(n, 3) predicted tip [m]: of the robot as it was given, of the base model, and with effects."""
     train_error: Error
     test_error: Error
+
+    def in_vain(self, noise: float) -> bool:
+        """Whether effects were found where the base model left no more than the `noise` [m] anywhere, and
+        data held out gain little of what the fitted ones do."""
+        train, test = self.train_error, self.test_error
+        gained, held_out = (1.0 - (error.after / error.before) ** 2 for error in (train, test))
+        at_noise = max(train.before, test.before) <= _NEAR * noise
+        return bool(self.names) and at_noise and held_out < _CONFIRMS * gained
 
 
 def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
