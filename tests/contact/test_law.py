@@ -38,7 +38,7 @@ def world(rng, m, n, mu):
         np.zeros((m, 3)),
         np.empty((n, n)),
         np.empty(n),
-        np.empty((2, n)),
+        np.empty((5, n)),
     )
 
 

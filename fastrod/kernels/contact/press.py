@@ -75,7 +75,7 @@ class PressedWorld(NamedTuple):
     step: Floats
     """(n,) out: change of the unknowns."""
     room: Floats
-    """(2, n)"""
+    """(5, n)"""
 
 
 class Touching(NamedTuple):
@@ -530,14 +530,12 @@ def _slope(mu: float, y: Vec, r: int, c: int) -> float:
 
 
 @kernel
-def _slope_along(m: int, n: int, pressing: PressedWorld, at: Floats, step: Floats) -> float:
-    """Slope of the potential along a step, where the unknowns have changed by `at`."""
+def _slope_along(m: int, n: int, pressing: PressedWorld, at: Floats, step: Floats, stiff: Floats) -> float:
+    """Slope of the potential along a `step`, of which the Hessian makes `stiff`, where the unknowns have
+    changed by `at`."""
     total = 0.0
     for a in range(n):
-        value = pressing.gradient[a]
-        for c in range(n):
-            value += pressing.hessian[a, c] * at[c]
-        total += value * step[a]
+        total += pressing.gradient[a] * step[a] + stiff[a] * at[a]
     for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
         force, _ = in_cone(law[0], _requested(law, _moved(n, along, pressing.free[k], at)))
@@ -550,17 +548,58 @@ def _slope_along(m: int, n: int, pressing: PressedWorld, at: Floats, step: Float
     return total
 
 
+@inline
+def _piece(mu: float, y: Vec) -> int:
+    """Which piece of the law y is in: 0 no force, 1 where force is linear in y, 2 slip with friction."""
+    if mu > 0.0 and math.sqrt(y[1] * y[1] + y[2] * y[2]) > mu * y[0]:
+        return 2 if y[0] + mu * math.sqrt(y[1] * y[1] + y[2] * y[2]) > 0.0 else 0
+    return 1 if y[0] > 0.0 else 0
+
+
+@kernel
+def _is_linear(m: int, n: int, pressing: PressedWorld, before: Floats, after: Floats) -> bool:
+    """Whether the forces are linear between two changes of the unknowns: then a Newton step is exact."""
+    for k in range(m):
+        along, law, free = pressing.along[k], pressing.law[k], pressing.free[k]
+        one = _piece(law[0], _requested(law, _moved(n, along, free, before)))
+        if one == 2 or one != _piece(law[0], _requested(law, _moved(n, along, free, after))):
+            return False
+    return True
+
+
+@kernel
+def _factor(n: int, l: Floats, diagonal: Floats, column: Floats) -> bool:  # noqa: E741
+    """Cholesky's factor in place, one over its diagonal in it, column by column: its rows are long enough for
+    SIMD. Whether all pivots were positive; the diagonal stands for one that is not."""
+    good = True
+    for a in range(n):
+        diagonal[a] = l[a, a]
+    for j in range(n):
+        pivot = l[j, j]
+        if not pivot > _PIVOT * abs(diagonal[j]):
+            pivot, good = abs(diagonal[j]) + 1e-300, False
+        inverse = 1.0 / math.sqrt(pivot)
+        l[j, j] = inverse
+        for a in range(j + 1, n):
+            column[a] = l[a, j] * inverse
+            l[a, j] = column[a]
+        for a in range(j + 1, n):
+            scaled = column[a]
+            for c in range(j + 1, a + 1):
+                l[a, c] -= scaled * column[c]
+    return good
+
+
 @kernel
 def _newton_step(m: int, n: int, pressing: PressedWorld, to: Floats) -> bool:
-    """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive; the diagonal
-    stands for one that is not."""
-    l, step, good = pressing.matrix, pressing.step, True  # noqa: E741
+    """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive."""
+    l, step = pressing.matrix, pressing.step  # noqa: E741
     for a in range(n):
-        value = pressing.gradient[a]
-        for c in range(n):
-            l[a, c] = pressing.hessian[a, c]
-            value += l[a, c] * step[c]
-        to[a] = -value
+        to[a] = -pressing.gradient[a]
+    for c in range(n):
+        for a in range(n):
+            l[c, a] = pressing.hessian[c, a]
+            to[a] -= l[c, a] * step[c]
     for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
         y = _requested(law, _moved(n, along, pressing.free[k], step))
@@ -575,28 +614,16 @@ def _newton_step(m: int, n: int, pressing: PressedWorld, to: Floats) -> bool:
                         scaled = d * along[r, a]
                         for c in range(a + 1 if scaled != 0.0 else 0):
                             l[a, c] += scaled * along[s, c]
-    for j in range(n):
-        pivot = l[j, j]
-        for k in range(j):
-            pivot -= l[j, k] * l[j, k]
-        if not pivot > _PIVOT * abs(l[j, j]):
-            pivot, good = abs(l[j, j]) + 1e-300, False
-        inverse = 1.0 / math.sqrt(pivot)
-        l[j, j] = inverse
-        for a in range(j + 1, n):
-            value = l[a, j]
-            for k in range(j):
-                value -= l[a, k] * l[j, k]
-            l[a, j] = value * inverse
-    for a in range(n):
-        for k in range(a):
+    good = _factor(n, l, pressing.room[2], pressing.room[3])
+    for k in range(n):
+        to[k] *= l[k, k]
+        for a in range(k + 1, n):
             to[a] -= l[a, k] * to[k]
-        to[a] *= l[a, a]
     for b in range(n):
-        a = n - 1 - b
-        for k in range(a + 1, n):
+        k = n - 1 - b
+        to[k] *= l[k, k]
+        for a in range(k):
             to[a] -= l[k, a] * to[k]
-        to[a] *= l[a, a]
     return good
 
 
@@ -646,25 +673,32 @@ def _minimise(
     """Newton's method from the present step until one changes it by less than `small` of itself: whether it
     has ended, and whether the forces still turn with their surfaces."""
     step, to, trial, damping = pressing.step, pressing.room[0], pressing.room[1], _DAMPS
+    stiff = pressing.room[4]
     for _ in range(rounds):
         while not _newton_step(m, n, pressing, to) and damping < _MOST_DAMPED:
             _make_convex(n, m, contacts, pressing, turned, damping)
             damping, turned = damping if turned else _STIFFENS * damping, False
+        for a in range(n):
+            stiff[a] = 0.0
+        for c in range(n):
+            for a in range(n):
+                stiff[a] += pressing.hessian[c, a] * to[c]
         low, high, fraction = 0.0, 1.0, 1.0
-        first = abs(_slope_along(m, n, pressing, step, to))
+        first = abs(_slope_along(m, n, pressing, step, to, stiff))
         for _ in range(_HALVINGS):
             for a in range(n):
                 trial[a] = step[a] + fraction * to[a]
-            slope = _slope_along(m, n, pressing, trial, to)
+            slope = _slope_along(m, n, pressing, trial, to, stiff)
             if abs(slope) <= _SHALLOW * first or (fraction == 1.0 and slope < 0.0):
                 break
             low, high = (fraction, high) if slope < 0.0 else (low, fraction)
             fraction = 0.5 * (low + high)
+        exact = fraction == 1.0 and _is_linear(m, n, pressing, step, trial)
         size, largest = 0.0, 0.0
         for a in range(n):
             step[a] += fraction * to[a]
             size, largest = max(size, abs(fraction * to[a])), max(largest, abs(step[a]))
-        if not size > small * max(1.0, largest):
+        if exact or not size > small * max(1.0, largest):
             return True, turned
     return False, turned
 

@@ -122,24 +122,33 @@ def _put(sample: Record, fraction: float, distance: float, slope: float) -> None
 
 @kernel
 def minimum(
-    search: ProximitySearch, k: int, j: int, low: float, high: float, phi_high: float
+    search: ProximitySearch,
+    k: int,
+    j: int,
+    low: float,
+    high: float,
+    slope_low: float,
+    slope_high: float,
+    phi_high: float,
 ) -> tuple[float, float, Vec]:
     """Fraction, signed distance and normal of the minimum in the interval after node j: phi falls at `low`,
-    and at `high` it rises or is higher. Bisection on the slope, with a secant once both ends have one."""
+    and at `high` it rises or is higher. Secants on the slope where both ends have one, an end that stays
+    counting by half (Dowell and Jarratt 1971), else bisection."""
     curve, frame, stack = search.curve, search.frames[k], search.work.stack
-    slope_low, slope_high = 0.0, 0.0
-    fraction, d, n = high, phi_high, (0.0, 0.0, 1.0)
-    for count in range(_ITERATIONS):
-        split = slope_low / (slope_low - slope_high) if slope_low < 0.0 < slope_high and count % 3 else 0.5
+    fraction, d, n, stays = high, phi_high, (0.0, 0.0, 1.0), 0
+    for _ in range(_ITERATIONS):
+        split = slope_low / (slope_low - slope_high) if slope_low < 0.0 < slope_high else 0.5
         fraction = low + min(max(split, 0.01), 0.99) * (high - low)
         d, n, _ = signed_distance(k, frame, point_at(curve, j, fraction), FAR, search.surfaces, stack)
         slope = dot(n, tangent_at(curve, j, fraction))
         if abs(slope) < _FLAT or high - low < 1e-7:
             break
         if slope < 0.0 and d <= phi_high:
-            low, slope_low = fraction, slope
+            low, slope_low, slope_high = fraction, slope, slope_high * (0.5 if stays > 0 else 1.0)
+            stays = 1
         else:
             high, slope_high, phi_high = fraction, slope, max(d, phi_high) if slope > 0.0 else d
+            slope_low, stays = slope_low * (0.5 if stays < 0 else 1.0), -1
     return fraction, d, n
 
 
@@ -226,7 +235,7 @@ def _search_interval(
                 place = x0 if f0 <= f1 else x1  # an end is the minimum, or the rod lies along the surface
                 d, normal, _ = signed_distance(k, frame, point_at(curve, j, place), FAR, surfaces, stack)
             elif (falls and (rises or f1 > f0)) or (rises and f0 > f1):
-                place, d, normal = minimum(search, k, j, x0, x1, max(f0, f1))
+                place, d, normal = minimum(search, k, j, x0, x1, g0, g1, max(f0, f1))
             smallest = min(smallest, d - rho)
             if d - rho < options.margin:
                 s = max(options.first, curve.arclength[j] + place * h)
