@@ -17,6 +17,7 @@ from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.linearised import LinearisedModel, target_of
+from fastrod.identification.search.search import N_BLOCKS, Search
 
 NOISE = 2e-4
 SPRING = {"name": "tip_spring", "stiffness": 12.0, "x": 0.05, "y": -0.03, "z": 0.08}
@@ -42,6 +43,28 @@ def found(name: str) -> Result:
     tip = replay(log, replace(robot, effects=(sealed,))).tip_position
     tip = tip + np.random.default_rng(3).normal(0.0, NOISE, tip.shape)
     return identify(replace(log, tip_position=tip), robot, threads=1)
+
+
+@pytest.mark.study
+def test_an_effect_with_which_the_rod_is_lost_is_none() -> None:
+    """However little it leaves: samples at which the rod finds no balance do not count."""
+    robot, n = one_segment(), 60
+    log = log_of(robot, wave(robot, n, dt=0.1, size=0.9), 0.1)
+    tip = replay(log, replace(robot, effects=(SPRING,))).tip_position
+    samples, model = sample(replace(log, tip_position=tip)), base_model(robot)
+    target = target_of(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False)
+    search = Search(samples, PredictedRod(samples, robot), target, np.arange(n) * N_BLOCKS // n)
+    state = search.start(model, model.start)
+    candidate = search.candidate(state, "tip_spring")
+    assert candidate.state is not None
+    assert search._exact(state, candidate).state is not None
+    fit = candidate.state.fit
+    far = np.clip(fit.theta, *candidate.state.model.limits)
+    far[-4:] = candidate.state.model.limits[1][-4:]  # as stiff, and to a point as far off, as can be
+    lost = replace(candidate, state=replace(candidate.state, fit=replace(fit, theta=far)))
+    refused = search._exact(state, lost)
+    assert refused.state is None
+    assert refused.why.startswith("with it the rod finds no balance at ")
 
 
 @pytest.mark.study

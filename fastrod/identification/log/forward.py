@@ -413,7 +413,8 @@ class PreparedLog:
                 break
             force = force + change
             opened.tip_force = given + force
-            before, pose = pose, rod.solve(*self.kernel(opened), robot)
+            before, pose = pose, rod.solve(*self.kernel(opened), robot, pose.ok)
+            pose = pose._replace(ok=pose.ok & before.ok)  # a rod that is lost on the way is not tried again
             answer = rod.answer
             # what the rod did beyond its compliance corrects it along the change (Broyden 1965)
             beyond = np.where(pose.ok[:, None], pose.position - before.position - expected, 0.0)

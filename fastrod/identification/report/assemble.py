@@ -114,6 +114,7 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     residual = np.asarray(samples.log.tip_position) - after
     seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
     outlier[seen] = ~keep(samples.on(seen), residual[seen], base.noise)
+    measured = measured & np.isfinite(before).all(1) & np.isfinite(after).all(1)
     used, test = measured & ~log.tested & ~outlier, measured & log.tested & ~outlier
     tested = measured & log.tested
     length = base.noise.model.length
@@ -314,6 +315,12 @@ def _left_out(explained: Explained, error: Error) -> list[str]:
     """Return how many rows jump beside what was found, and what they do to the held-out error."""
     n, every = int(explained.outlier.sum()), int(explained.search.samples.log.measured.sum())
     said = [f"{n} of {every} rows are outliers of what is left and do not count"] * (n > _MANY * every)
+    measured = explained.search.samples.log.measured
+    if lost := int((measured & ~(explained.used | explained.test | explained.outlier)).sum()):
+        said.append(
+            f"at {lost} of {every} rows the rod finds no balance in the model before or after: they do not "
+            "count in either error"
+        )
     if error.all_rows > _DIFFERS * error.after:
         said.append(
             f"with the rows that jump the held-out error is {1e3 * error.all_rows:.3g} mm and not "

@@ -79,7 +79,9 @@ class Visits:
         """Return what a predicted tip (n_samples, 3) [m] leaves at these visits; None where they are too
         few."""
         residual = self.measured - tip
-        mean = np.array([np.nanmean(residual[rows], axis=0) for rows in self.rows]).reshape(-1, 3)
+        known, nowhere = np.asarray(np.isfinite(residual).all(1)), np.full(3, np.nan)
+        seen = [residual[rows[known[rows]]] for rows in self.rows]
+        mean = np.array([each.mean(0) if len(each) else nowhere for each in seen]).reshape(-1, 3)
         one, other = mean[self.pairs.T]
         known = np.isfinite(one).all(1) & np.isfinite(other).all(1)
         one, other, alike, bent = one[known], other[known], self.alike[known], self.bent[known]

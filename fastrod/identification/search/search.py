@@ -68,6 +68,9 @@ _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _STIFF = 0.01  # of a segment's own stiffness, over that of a tendon
 _LOST = 5.0  # times the own loss of a block that others predict
+_FEW_LOST = 0.01  # of the samples
+_MOST_OF = 0.5  # of what the best takes away: an effect that takes less is no rival by its blocks alone
+_AS_WELL = 1.05  # of a held-out loss
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
 _REFINED = 6  # candidates that are solved exactly at each stage
@@ -146,16 +149,17 @@ class Search:
 
     def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
         """The model solved at a state's parameters, and these. Of a rod of modes, whose tendons go slack
-        where no slope says so, at parameters that are nearer to those of the last solution, where it fitted
-        better."""
+        where no slope says so, and where rods are lost, at parameters that are nearer to those of the last
+        solution, where it fitted better."""
         model, theta, last = state.model, state.theta, state.linearised
 
         def cost(of: LinearisedModel, at: Floats) -> float:
             mean, sd = model.prior
-            return float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
+            cost = float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
+            return np.inf if _lost(last, of) > _FEW_LOST else cost
 
         linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
-        if self.rod.of_modes:
+        if self.rod.of_modes or _lost(last, linearised) > _FEW_LOST:
             known = {u.name: number for u, number in zip(last.model.unknowns, last.theta, strict=True)}
             there = np.array([known.get(u.name, u.outside(u.mean)) for u in model.unknowns])
             before = cost(last.under(self.target), there)
@@ -386,6 +390,17 @@ class Search:
             )
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
+    def _exact(self, state: ModelState, candidate: Candidate) -> Candidate:
+        """A fitted candidate with the rod solved at its parameters. Samples at which the rod then finds no
+        balance do not count, and the worse an effect is the fewer would: with many it is none."""
+        assert candidate.state is not None
+        with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
+        lost = 0.0 if self.in_motion else _lost(state.linearised, with_it.linearised)
+        if lost > _FEW_LOST:
+            why = f"with it the rod finds no balance at {100.0 * lost:.0f} % of the samples"
+            return unfitted(candidate.name, why, candidate.n_parameters)
+        return self.judged(state, with_it, candidate.name)
+
     def _worth(self, state: ModelState) -> float:
         """Samples that a state's residual is worth, of which coloured noise leaves fewer."""
         residual = state.fit.residual
@@ -519,16 +534,11 @@ class Search:
         ]
         # of these even the fit so far is linear
         heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
-        exact = {}
-        for candidate in dict.fromkeys([*near, *heavy]):
-            assert candidate.state is not None
-            refined = self.refined(candidate.state, borrow=self.rod.of_modes)
-            exact[candidate.name] = self.judged(state, refined, candidate.name)
+        exact = {c.name: self._exact(state, c) for c in dict.fromkeys([*near, *heavy])}
         best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
-                refined = self.refined(candidate.state, borrow=self.rod.of_modes)
-                exact[name] = self.judged(state, refined, name)
+                exact[name] = self._exact(state, candidate)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = best_of(passing)
@@ -552,7 +562,10 @@ class Search:
             [
                 c
                 for c in rivals
-                if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL
+                if c.passes
+                and c.n_parameters < best.n_parameters
+                and advantage(best, c) < BIC_RIVAL
+                and _predicts_as_well(c, best)
             ]
         )
         if fewer is not None:
@@ -564,7 +577,9 @@ class Search:
     def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
             return False
-        if advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL:
+        if advantage(best, other) < BIC_RIVAL:
+            return True
+        if z_between(best, other) < Z_RIVAL and other.fraction > _MOST_OF * best.fraction:
             return True
         assert best.state is not None
         sigma = best.state.linearised.target.sigma
@@ -715,6 +730,18 @@ def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
 def _distinct(one: Candidate, other: Candidate) -> bool:
     """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
     return other.state is None or _clearly_better(one, other)
+
+
+def _lost(before: LinearisedModel, after: LinearisedModel) -> float:
+    """Return the fraction of samples that have a balance in one model and none in the other."""
+    return float((before.pose.ok & ~after.pose.ok).mean())
+
+
+def _predicts_as_well(one: Candidate, other: Candidate) -> bool:
+    """Whether a candidate's blocks, each held out, are predicted as well as by the other."""
+    assert one.state is not None
+    assert other.state is not None
+    return bool(one.state.losses.sum() < _AS_WELL * other.state.losses.sum())
 
 
 def _clearly_better(one: Candidate, other: Candidate) -> bool:
