@@ -149,17 +149,16 @@ class Search:
 
     def _solved(self, state: ModelState) -> tuple[LinearisedModel, Floats]:
         """The model solved at a state's parameters, and these. Of a rod of modes, whose tendons go slack
-        where no slope says so, and where rods are lost, at parameters that are nearer to those of the last
-        solution, where it fitted better."""
+        where no slope says so, at parameters that are nearer to those of the last solution, where it fitted
+        better."""
         model, theta, last = state.model, state.theta, state.linearised
 
         def cost(of: LinearisedModel, at: Floats) -> float:
             mean, sd = model.prior
-            cost = float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
-            return np.inf if _lost(last, of) > _FEW_LOST else cost
+            return float((of.residual(model, at) ** 2).sum() + (((at - mean) / sd) ** 2).sum())
 
         linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target, last)
-        if self.rod.of_modes or _lost(last, linearised) > _FEW_LOST:
+        if self.rod.of_modes:
             known = {u.name: number for u, number in zip(last.model.unknowns, last.theta, strict=True)}
             there = np.array([known.get(u.name, u.outside(u.mean)) for u in model.unknowns])
             before = cost(last.under(self.target), there)
@@ -395,7 +394,9 @@ class Search:
         balance do not count, and the worse an effect is the fewer would: with many it is none."""
         assert candidate.state is not None
         with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
-        lost = 0.0 if self.in_motion else _lost(state.linearised, with_it.linearised)
+        lost = 0.0
+        if not self.in_motion:
+            lost = float((state.linearised.pose.ok & ~with_it.linearised.pose.ok).mean())
         if lost > _FEW_LOST:
             why = f"with it the rod finds no balance at {100.0 * lost:.0f} % of the samples"
             return unfitted(candidate.name, why, candidate.n_parameters)
@@ -730,11 +731,6 @@ def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
 def _distinct(one: Candidate, other: Candidate) -> bool:
     """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
     return other.state is None or _clearly_better(one, other)
-
-
-def _lost(before: LinearisedModel, after: LinearisedModel) -> float:
-    """Return the fraction of samples that have a balance in one model and none in the other."""
-    return float((before.pose.ok & ~after.pose.ok).mean())
 
 
 def _predicts_as_well(one: Candidate, other: Candidate) -> bool:
