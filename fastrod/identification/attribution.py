@@ -211,8 +211,8 @@ def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:
 def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
     """All that follows from what a search has found, and data held out confirm."""
     explained = explain(log, base, outcome)
-    if explained.in_vain(base.noise.floor):
-        outcome = _nothing_found(base, outcome)
+    if why := explained.refused(base.noise.floor):
+        outcome = _nothing_found(base, outcome, why)
         explained = explain(log, base, outcome)
     remaining = residual_structure(
         base.search.samples,
@@ -397,9 +397,9 @@ def _candidates(
     )
 
 
-def _nothing_found(base: BaseFit, outcome: SearchOutcome) -> SearchOutcome:
-    """The outcome without what was found."""
-    first, why = outcome.steps[0], "data held out do not gain what the fitted ones do"
+def _nothing_found(base: BaseFit, outcome: SearchOutcome, why: str) -> SearchOutcome:
+    """The outcome without what was found, and why."""
+    first = outcome.steps[0]
     tried = tuple(replace(c, why=why) if c.name in outcome.names else c for c in first.candidates)
     none = replace(first, candidates=tried, taken=None, rivals=())
     start = outcome.start

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.split import split, thinned
 from fastrod.identification.report import report
+from fastrod.identification.report.assemble import Explained
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
-from fastrod.identification.report.result import Result
+from fastrod.identification.report.result import Error, Result
 from fastrod.identification.search import search
 from fastrod.identification.search.base import fit_base
 from fastrod.logs.runlog import RunLog
@@ -86,6 +88,28 @@ def test_what_data_held_out_do_not_gain_from_is_no_finding(
     assert not result.effects
     assert result.test.after == result.test.before
     assert [t.name for t in result.tried if t.why.startswith("data held out do not gain")]
+
+
+@pytest.mark.parametrize(
+    ("lost", "fitted", "held_out", "why"),
+    [
+        (0.05, (3.0, 1.0), (3.0, 1.0), "with it the rod finds no balance at 5 % of the samples"),
+        (0.005, (3.0, 1.0), (3.0, 1.0), ""),
+        (0.0, (1.0, 0.98), (0.9, 0.92), "data held out do not gain what the fitted ones do"),
+        (0.0, (1.0, 0.98), (1.0, 0.98), ""),
+        (0.0, (3.0, 1.0), (3.0, 3.1), ""),  # there is much to be found: the verdict says how much is left
+    ],
+)
+def test_what_is_found_holds_on_all_samples_and_on_those_held_out(
+    lost: float, fitted: tuple[float, float], held_out: tuple[float, float], why: str
+) -> None:
+    """Errors before and after, in noises."""
+    tip, every = np.zeros((1000, 3)), np.ones(1000, bool)
+    after = np.where(np.arange(1000)[:, None] < 1000 * lost, np.nan, tip)
+    errors = (Error(before=b, after=a, interval=(a, a)) for b, a in (fitted, held_out))
+    state: Any = None
+    explained = Explained(state, state, state, ("friction",), ~every, every, every, tip, tip, after, *errors)
+    assert explained.refused(1.0) == why
 
 
 @pytest.mark.study

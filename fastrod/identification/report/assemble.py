@@ -24,7 +24,7 @@ from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import BIC_STRONG, Z_ACCEPT, ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
-from fastrod.identification.search.search import Search, SearchOutcome
+from fastrod.identification.search.search import Search, SearchOutcome, lost_with_it
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import SLACK, OneSidedTendons
@@ -79,13 +79,18 @@ class Explained:
     train_error: Error
     test_error: Error
 
-    def in_vain(self, noise: float) -> bool:
-        """Whether effects were found where the base model left no more than the `noise` [m] anywhere, and
-        data held out gain little of what the fitted ones do."""
+    def refused(self, noise: float) -> str:
+        """Why what was found is nothing, or an empty string: with it the rod finds no balance at samples, or
+        the base model left no more than the `noise` [m] anywhere and data held out gain little of what the
+        fitted ones do."""
+        known, found = (np.asarray(np.isfinite(tip).all(1)) for tip in (self.bare, self.after))
+        if lost := lost_with_it(known, found):
+            return lost
         train, test = self.train_error, self.test_error
         gained, held_out = (1.0 - (error.after / error.before) ** 2 for error in (train, test))
         at_noise = max(train.before, test.before) <= _NEAR * noise
-        return bool(self.names) and at_noise and held_out < _CONFIRMS * gained
+        in_vain = bool(self.names) and at_noise and held_out < _CONFIRMS * gained
+        return "data held out do not gain what the fitted ones do" if in_vain else ""
 
 
 def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:

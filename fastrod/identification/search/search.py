@@ -58,7 +58,7 @@ from fastrod.identification.search.solve import (
     rms,
 )
 from fastrod.model.robot import Robot
-from fastrod.types import Floats, Ints
+from fastrod.types import Flags, Floats, Ints
 
 N_BLOCKS = 20
 MOST_PASSES = 4000.0
@@ -394,11 +394,8 @@ class Search:
         balance do not count, and the worse an effect is the fewer would: with many it is none."""
         assert candidate.state is not None
         with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
-        lost = 0.0
-        if not self.in_motion:
-            lost = float((state.linearised.pose.ok & ~with_it.linearised.pose.ok).mean())
-        if lost > _FEW_LOST:
-            why = f"with it the rod finds no balance at {100.0 * lost:.0f} % of the samples"
+        poses = state.linearised.pose, with_it.linearised.pose
+        if not self.in_motion and (why := lost_with_it(*(pose.ok for pose in poses))):
             return unfitted(candidate.name, why, candidate.n_parameters)
         return self.judged(state, with_it, candidate.name)
 
@@ -731,6 +728,13 @@ def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
 def _distinct(one: Candidate, other: Candidate) -> bool:
     """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
     return other.state is None or _clearly_better(one, other)
+
+
+def lost_with_it(before: Flags, after: Flags) -> str:
+    """That too many samples (n,) have a balance before an effect and none after it, or nothing."""
+    lost = float((before & ~after).mean())
+    said = f"with it the rod finds no balance at {100.0 * lost:.0f} % of the samples"
+    return said if lost > _FEW_LOST else ""
 
 
 def _predicts_as_well(one: Candidate, other: Candidate) -> bool:
