@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+import peer_elastica
+import peer_mujoco
+import peer_soromox
 import release
-import release_elastica
-import release_mujoco
-import release_soromox
 from appendix_j import Array, Build, Peer, Rung
 from bench_peers import Point, Ratio, front, one_core, time_ratio
 from report import Measurement, Row, Section, bench, note_progress, table
 
 PEERS: Sequence[Peer] = (
-    *(release.PEER, release_elastica.PEER, release_soromox.PCS, release_soromox.GVS),
-    *(release_mujoco.FLEX, release_mujoco.BALLS, release_mujoco.HINGES),
+    *(release.PEER, peer_elastica.RELEASED, peer_soromox.PCS_RELEASED, peer_soromox.GVS_RELEASED),
+    *(peer_mujoco.FLEX_RELEASED, peer_mujoco.BALLS_RELEASED, peer_mujoco.HINGES_RELEASED),
 )
 GOALS = {"PyElastica": 100.0, "soromox": 10.0, "MuJoCo": 10.0}  # times faster at equal error
 BATCH = 256
@@ -155,7 +155,7 @@ def measure(options: Any) -> list[Section]:
 
 
 def _slow(peer: Peer) -> bool:
-    return peer.family == "soromox" or peer is release_mujoco.FLEX
+    return peer.family == "soromox" or peer is peer_mujoco.FLEX_RELEASED
 
 
 def _kinds(alone: Sequence[tuple[Point, str]], together: Sequence[tuple[Point, str]]) -> Section:
