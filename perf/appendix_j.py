@@ -85,7 +85,8 @@ class Peer:
     def missing(self) -> str | None:
         """A sentence where the peer cannot run here."""
         absent = [name for name in self.modules if importlib.util.find_spec(name) is None]
-        words = f"is left out: {' and '.join(absent)} is not installed (pip install -e '.[peers]')."
+        are = "is" if len(absent) == 1 else "are"
+        words = f"is left out: {' and '.join(absent)} {are} not installed (pip install -e '.[peers]')."
         return f"{self.name} {words}" if absent else None
 
     def versions(self) -> str:
