@@ -22,6 +22,7 @@ from appendix_j import Array, Peer, Rung, Solve, one_by_one
 # times as large.
 _SHEAR = 7.0
 _AT_REST, _IN_MOTION = 0.6, 0.9  # of the stability limit
+_ALSO = "shear and stretch, contact between rods, muscles, many rods joined."
 _MOVING = ("position_collection", "director_collection", "velocity_collection", "omega_collection")
 
 
@@ -139,7 +140,7 @@ PEER = Peer(
     same="its Cosserat rod begun half an element before the wall; shear and stretch cannot be left out, so "
     "they are made stiff, the more the finer, which takes off some of the elements' own error; rotary "
     "inertia for large stable steps, the first mode critically damped.",
-    also="dynamics, shear and stretch, contact between rods, muscles, many rods joined.",
+    also=f"dynamics, {_ALSO}",
     rungs=[
         Rung(f"{n} elements, {patience:g} / omega", partial(_relax, n, patience))
         for n, patience in ((4, 8.0), (8, 11.0), (14, 13.0), (24, 15.0))
@@ -151,7 +152,7 @@ RELEASED = Peer(
     same="its Cosserat rod begun half an element before the wall, without damping, position Verlet at 0.9 of "
     "the stable step; shear and stretch cannot be left out, so they are as stiff as the round section's, or "
     "some times stiffer.",
-    also="shear and stretch, contact between rods, muscles, many rods joined.",
+    also=_ALSO,
     rungs=[
         Rung(f"{n} elements, shear x {stiff:g}", partial(_swing, n, stiff))
         for n, stiff in ((5, 0.5), (8, 0.5), (12, 0.5), (12, 1.0), (16, 2.0), (24, 4.0))

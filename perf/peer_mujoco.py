@@ -267,6 +267,7 @@ def _released(name: str, kind: Kind, same: str, integrator: str, *pairs: tuple[i
     return Peer(f"MuJoCo {name}", ("mujoco",), same, _ALSO, rungs)
 
 
+_STABLE = ((4, 1.0), (6, 0.5), (8, 0.25), (12, 0.125), (16, 0.0625))
 FLEX_RELEASED = _released(
     "rod (flexcomp)",
     "flex",
@@ -286,21 +287,13 @@ BALLS_RELEASED = _released(
     "ones damp what is not damped; in steps near the longest that are stable. Twist, which nothing loads, "
     "gets EI too, for a ball has one stiffness, and inertia for long steps.",
     "RK4",
-    (4, 1.0),
-    (6, 0.5),
-    (8, 0.25),
-    (12, 0.125),
-    (16, 0.0625),
+    *_STABLE,
 )
 HINGES_RELEASED = _released(
     "chain, hinges",
     "hinge",
     "the same chain with hinges across the plane of the load: a plane rod, and the plane is given to it.",
     "RK4",
-    (4, 1.0),
-    (6, 0.5),
-    (8, 0.25),
-    (12, 0.125),
-    (16, 0.0625),
+    *_STABLE,
     (24, 0.03125),
 )

@@ -75,7 +75,7 @@ class PressedWorld(NamedTuple):
     step: Floats
     """(n,) out: change of the unknowns."""
     room: Floats
-    """(5, n)"""
+    """(5, n) a step, a trial, a matrix's diagonal, a column of it, and the Hessian times the step."""
 
 
 class Touching(NamedTuple):
@@ -551,9 +551,10 @@ def _slope_along(m: int, n: int, pressing: PressedWorld, at: Floats, step: Float
 @inline
 def _piece(mu: float, y: Vec) -> int:
     """Which piece of the law y is in: 0 no force, 1 where force is linear in y, 2 slip with friction."""
-    if mu > 0.0 and math.sqrt(y[1] * y[1] + y[2] * y[2]) > mu * y[0]:
-        return 2 if y[0] + mu * math.sqrt(y[1] * y[1] + y[2] * y[2]) > 0.0 else 0
-    return 1 if y[0] > 0.0 else 0
+    force, size = in_cone(mu, y)
+    if force[0] <= 0.0:
+        return 0
+    return 1 if mu == 0.0 or size <= mu * y[0] else 2
 
 
 @kernel
