@@ -436,11 +436,16 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
             search, alone = search.weighed(step.taken.state, base.noise.sigma)
         if len(found) > 1:
             excess = base.start.fit.loss * float((base.search.target.sigma**2).mean()) - noise
-            alone, found = search.eliminated(alone, found, _MIN_GAIN * max(excess, 0.0), noise)
+            least = _MIN_GAIN * max(excess, 0.0)
+            alone, found = search.eliminated(alone, found, least, noise)
+            alone, kept, again = search.again_beside_all(alone, found, steps)
+            steps += again
+            if kept != found:
+                alone, found = search.eliminated(alone, kept, least, noise)
         while len(found) > max_effects:
             fewer = {name: search.without(alone, name) for name in found}
-            least = min(fewer, key=lambda name: fewer[name].fit.loss)
-            alone, found = fewer[least], [name for name in found if name != least]
+            weakest = min(fewer, key=lambda name: fewer[name].fit.loss)
+            alone, found = fewer[weakest], [name for name in found if name != weakest]
         search, alone = search.weighed(alone, base.noise.sigma)
     stopped = (
         f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes "

@@ -210,6 +210,10 @@ def test_two_forms_that_are_as_wrong_are_rivals() -> None:
     one of them is the better form; at the noise any difference that blocks confirm is one."""
     assert equally_wrong(11.6**2, 0.775**2, 0.777**2, 0.69**2)
     assert not equally_wrong(11.6**2, 0.775**2, 0.800**2, 0.69**2)
+    # five numbers more fit six times as much of what the form has wrong
+    assert equally_wrong(11.6**2, 0.775**2, 0.785**2, 0.69**2, 5)
+    assert not equally_wrong(11.6**2, 0.775**2, 0.785**2, 0.69**2, -5)
+    assert not equally_wrong(11.6**2, 0.775**2, 0.800**2, 0.69**2, 5)
     assert not equally_wrong(11.6**2, 0.690**2, 0.691**2, 0.69**2)
     # 3 mm are left: of two that take little away, one takes twice as much
     assert not equally_wrong(3.10**2, 3.05**2, 3.075**2, 0.69**2)

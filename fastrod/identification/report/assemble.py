@@ -24,7 +24,7 @@ from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import BIC_STRONG, Z_ACCEPT, ModelState, SearchStep
 from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
-from fastrod.identification.search.search import Search, SearchOutcome, lost_with_it
+from fastrod.identification.search.search import MOST_OF, Search, SearchOutcome, lost_with_it
 from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import SLACK, OneSidedTendons
@@ -101,8 +101,6 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
     if search.rod.of_modes or search.in_motion:
         rows = search.samples.rows
     start = outcome.start
-    if len(names) > 1:
-        names = tuple(names[i] for i in np.argsort([-_own(state, name) for name in names]))
     seen_all = search.in_motion or not (names and _flags_moved(search, state, base))
     if len(rows) > len(search.samples.rows) or not seen_all:
         piece = samples.on(rows)
@@ -111,6 +109,7 @@ def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
         # with its own weights: what the base model does not explain must not push its parameters
         again = search_on(piece, base, base.search.target.sigma, state).again(start)
         start = _nearer(start, again, piece, base)
+    names = _in_order(names, search, start, state, base.noise.sigma)
     bare = tips_of(start, samples, base)
     given = base.without
     before = tips_of(given.start, given.search.samples, given) if given else bare
@@ -143,7 +142,10 @@ def verdict_on(
     """The verdict on what was found, and what remains."""
     library, given = _square(outcome.state), base.without or base
     floor, error = base.noise.floor, explained.test_error
-    named = [s.taken for s in outcome.steps if s.taken and s.taken.name in explained.names]
+    # each where it was found
+    named = {
+        s.taken.name: s.taken for s in reversed(outcome.steps) if s.taken and s.taken.name in explained.names
+    }
     classes, (held_out, n_held_out) = _classes(outcome.steps, explained.names), _held_out(explained)
     return choose_verdict(
         base=_square(given.start),
@@ -161,7 +163,7 @@ def verdict_on(
         at_floor=held_out <= _NEAR * floor,
         like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
         evident=error.after < _FALLS * error.before
-        and all(one.z > Z_ACCEPT and one.bic_gain > BIC_STRONG for one in named),
+        and all(one.z > Z_ACCEPT and one.bic_gain > BIC_STRONG for one in named.values()),
     )
 
 
@@ -354,6 +356,19 @@ def _square(state: ModelState) -> float:
     """Mean square distance that a state leaves at the samples of the search [m^2]."""
     counted = state.fit.residual[np.any(state.fit.residual != 0.0, axis=1), :3]
     return float(np.mean(((counted * state.linearised.target.sigma) ** 2).sum(1))) if len(counted) else 0.0
+
+
+def _in_order(
+    names: tuple[str, ...], search: Search, start: ModelState, state: ModelState, noise: Floats
+) -> tuple[str, ...]:
+    """First the effect of `state` that moves the prediction most. Those that correct each other move it far,
+    too: they come after all that alone take half of what the best takes from `start`."""
+    if len(names) < 2:
+        return names
+    search, bare = search.weighed(start, noise)
+    takes = {name: bare.fit.loss - search.beside(bare, name, state).fit.loss for name in names}
+    least = MOST_OF * max(takes.values())
+    return tuple(sorted(names, key=lambda name: (takes[name] < least, -_own(state, name))))
 
 
 def _own(state: ModelState, name: str) -> float:
@@ -612,9 +627,8 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
     # leave a fit that starts far from where it should end
     search, piece = explained.search.weighed(explained.start, noise)
     for name in explained.names[:-1]:
-        added = search.candidate(piece, name).state
-        if added is not None:
-            search, piece = search.weighed(search.refined(added), noise)
+        added = search.refined(search.beside(piece, name, explained.state))
+        search, piece = search.weighed(added, noise)
         stages.append(stage(name, piece))
     return [*stages, *(stage(name, explained.state) for name in explained.names[-1:])]
 

@@ -140,10 +140,12 @@ def z_between(one: Candidate, other: Candidate) -> float:
     return paired(other.state.losses, one.state.losses)
 
 
-def equally_wrong(before: float, best: float, other: float, noise: float) -> bool:
+def equally_wrong(before: float, best: float, other: float, noise: float, more: int = 0) -> bool:
     """Whether of two held-out losses, the `best` and another one, both are so far above that of the `noise`
-    that they differ by less than their forms are wrong; and both take about as much off the loss `before`."""
-    return other - best < min(FRACTION_RIVAL * (best - noise), FRACTION_GAIN * (before - best))
+    that they differ by less than their forms are wrong; and both take about as much off the loss `before`.
+    Each of the numbers that the best has `more` fits some of that form."""
+    wrong = FRACTION_RIVAL * (1 + max(more, 0)) * (best - noise)
+    return other - best < min(wrong, FRACTION_GAIN * (before - best))
 
 
 def from_sub_law(state: ModelState, name: str, where: Mapping[str, str | float]) -> float:

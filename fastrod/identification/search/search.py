@@ -69,7 +69,7 @@ _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fit
 _STIFF = 0.01  # of a segment's own stiffness, over that of a tendon
 _LOST = 5.0  # times the own loss of a block that others predict
 _FEW_LOST = 0.01  # of the samples
-_MOST_OF = 0.5  # of what the best takes away: an effect that takes less is no rival by its blocks alone
+MOST_OF = 0.5  # of what the best takes away: an effect that takes less is no rival by its blocks alone
 _AS_WELL = 1.05  # of a held-out loss
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
@@ -173,7 +173,7 @@ class Search:
         """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
         [m], and the search with these: what a model does not explain yet must not push its parameters beyond
         their priors."""
-        sigma = self.target.sigma
+        sigma = state.linearised.target.sigma
         size = max(rms(state.fit.residual), float((noise / sigma).max()))
         search = replace(self, target=self.target.weighed(sigma * size, noise))
         return search, search.refined(search.refined(state), borrow=self.rod.of_modes)
@@ -556,16 +556,7 @@ class Search:
         rivals = [
             c for c in tried if c.alternative is None and c.name != best.name and self._rival(state, best, c)
         ]
-        fewer = best_of(
-            [
-                c
-                for c in rivals
-                if c.passes
-                and c.n_parameters < best.n_parameters
-                and advantage(best, c) < BIC_RIVAL
-                and _predicts_as_well(c, best)
-            ]
-        )
+        fewer = best_of([c for c in rivals if c.passes and _as_good(c, best)])
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
@@ -577,13 +568,20 @@ class Search:
             return False
         if advantage(best, other) < BIC_RIVAL:
             return True
-        if z_between(best, other) < Z_RIVAL and other.fraction > _MOST_OF * best.fraction:
+        if z_between(best, other) < Z_RIVAL and other.fraction > MOST_OF * best.fraction:
             return True
         assert best.state is not None
         sigma = best.state.linearised.target.sigma
         noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
         before, least, more = (float(s.losses.sum()) for s in (state, best.state, other.state))
-        return equally_wrong(before, least, more, noise)
+        return equally_wrong(before, least, more, noise, best.n_parameters - other.n_parameters)
+
+    def beside(self, state: ModelState, name: str, found: ModelState) -> ModelState:
+        """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
+        model = state.model.with_effect(name, drive=found.model.drive_of(name))
+        theta = np.concatenate([state.theta, found.from_here(model)[len(state.theta) :]])
+        fit = self._fit(state.linearised, model, theta, np.zeros(0), (), _MANY)
+        return self._state(model, state.linearised, fit, ())
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""
@@ -622,6 +620,34 @@ class Search:
                 break
             state, left = weakest[2], [name for name in left if name != weakest[1]]
         return state, left
+
+    def again_beside_all(
+        self, state: ModelState, found: Sequence[str], steps: Sequence[SearchStep]
+    ) -> tuple[ModelState, list[str], list[SearchStep]]:
+        """Judge what was found early, and its rivals, beside all that came later: an effect with fewer
+        numbers that does as well takes the place. The state, who is in it, and a step for each that was
+        judged. A rod of modes or in motion has no time for it."""
+        left, made = list(found), list[SearchStep]()
+        rivals = {step.taken.name: step.rivals for step in steps if step.taken is not None}
+        early = [] if self.in_motion or self.rod.of_modes else left[:-1]  # the last was judged beside all
+        for name in early:
+            fewer = self.without(state, name)
+            kept = self.judged(fewer, state, name)
+            others = [
+                other
+                for other in self.names(fewer)
+                if other != name
+                and (other in rivals.get(name, ()) or _numbers(fewer.model, other) < kept.n_parameters)
+            ]
+            step = self.choose(fewer, self._tried(fewer, others), with_alternatives=False)
+            best = step.taken
+            if best is not None and best.state is not None and _as_good(best, kept):
+                state, left = best.state, [best.name if one == name else one for one in left]
+                made.append(replace(step, rivals=(name, *step.rivals)))
+            else:
+                alike = tuple(c.name for c in step.candidates if self._rival(fewer, kept, c))
+                made.append(SearchStep(fewer, (kept, *step.candidates), kept, alike))
+        return state, left, made
 
     def bounds(self, state: ModelState) -> list[DetectionLimit]:
         """For every effect that is not in the model, the size from which it would have shown: three standard
@@ -676,6 +702,11 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _numbers(model: Model, name: str) -> int:
+    """Numbers that an effect adds to a model."""
+    return len(model.with_effect(name).unknowns) - len(model.unknowns)
 
 
 def _yields(robot: Robot) -> bool:
@@ -737,11 +768,13 @@ def lost_with_it(before: Flags, after: Flags) -> str:
     return said if lost > _FEW_LOST else ""
 
 
-def _predicts_as_well(one: Candidate, other: Candidate) -> bool:
-    """Whether a candidate's blocks, each held out, are predicted as well as by the other."""
+def _as_good(one: Candidate, other: Candidate) -> bool:
+    """Whether a candidate with fewer numbers explains as much as the other, and predicts blocks, each held
+    out, as well."""
     assert one.state is not None
     assert other.state is not None
-    return bool(one.state.losses.sum() < _AS_WELL * other.state.losses.sum())
+    few, alike = one.n_parameters < other.n_parameters, advantage(other, one) < BIC_RIVAL
+    return bool(few and alike and one.state.losses.sum() < _AS_WELL * other.state.losses.sum())
 
 
 def _clearly_better(one: Candidate, other: Candidate) -> bool:
