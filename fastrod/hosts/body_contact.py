@@ -164,8 +164,10 @@ class BodyContact(ABC):
 
     @final
     def push_half(self) -> None:
-        """Exert half of the last forces: for a step in which the rod's are not known."""
-        self._before, self.exerted, self._lost = 0.5 * self._before, 0.5 * self.exerted, True
+        """Exert half of the last forces, as far as they stop the body: for a step in which the rod's are not
+        known."""
+        half = self._stopping(0.5 * self.exerted) * 0.5 * self.exerted
+        self._before, self.exerted, self._lost = 0.5 * self._before, half, True
         self._begin_anew()
         self._exert()
 
@@ -180,7 +182,7 @@ class BodyContact(ABC):
         against no force, and what the rod would give it is nobody's energy."""
         motion = self.com()
         moment = matrix_from_quaternion(motion.pose[None, 3:])[0].T @ wrench[3:]
-        power = wrench[:3] @ wrench[:3] / self.mass + moment @ (moment / self._inertia)
+        power = wrench[:3] @ wrench[:3] / max(self.mass, 1e-300) + moment @ (moment / self._inertia)
         return float(min(1.0, max(-wrench @ motion.velocity, 0.0) / max(self.dt * power, 1e-300)))
 
     def _begin_anew(self, even: bool = False) -> None:

@@ -41,6 +41,7 @@ from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, I
 
 _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
 _SWINGS = 12  # steps back in which the steps must have become half as long
+_BACK_AND_FORTH, _SHORTEST = 2, 0.2  # swings after which steps are shortened, and by how much at most
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
 _MOVING = 2  # passes in which contacts follow the places where the gap is least
 # slips that a step uses are updated in so many passes, and in a rest after such a step [rad], to this [m]
@@ -363,7 +364,7 @@ class TouchingRods(ModalRods):
         most = _PASSES if self.dynamics else _TO_REST
         # last step, the least one that halved in time, and what the last leaves to be done [rad]
         size, least, over = np.full((3, n), np.inf)
-        swings, taken = np.zeros(n, np.int64), np.zeros_like(q)
+        swings, taken, relaxed = np.zeros(n, np.int64), np.zeros_like(q), np.ones(n)
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
         contacts.contact["slid"][rows] = 0.0
@@ -412,7 +413,12 @@ class TouchingRods(ModalRods):
             renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
             renew[size < (0.0 if self.dynamics else _NEAR)] = _EXACTLY
             self._press(left, (*seen, *model, renew, still, step, changed))
-            q[left] += step[left]
+            # steps that go back and forth, as where a normal swings with the rod: less of each, as the last
+            # two say (Irons and Tuck 1969, after Aitken)
+            change = step - taken
+            aitken = -relaxed * (taken * change).sum(1) / np.maximum((change**2).sum(1), 1e-300)
+            relaxed = np.where(swings >= _BACK_AND_FORTH, np.clip(aitken, _SHORTEST, 1.0), 1.0)
+            q[left] += relaxed[left, None] * step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
             known = (contacts.used == before[0]) & (contacts.contact["arclength"] == before[1]).all(1)
