@@ -553,6 +553,12 @@ class Search:
         ]
         # blocks that no fit has seen overrule the count of parameters
         best = max(sure, key=lambda c: c.fraction) if sure else best
+        best, *rivals = self._with_rivals(state, best, tried)
+        return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
+
+    def _with_rivals(self, state: ModelState, best: Candidate, tried: Sequence[Candidate]) -> list[Candidate]:
+        """The best, then its rivals. One with fewer numbers that does as well comes first; laws that contain
+        one another are told apart by their estimates."""
         rivals = [
             c for c in tried if c.alternative is None and c.name != best.name and self._rival(state, best, c)
         ]
@@ -560,8 +566,7 @@ class Search:
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
-        best, *rivals = by_estimate(best, rivals, tried)
-        return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
+        return by_estimate(best, rivals, tried)
 
     def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
@@ -639,14 +644,11 @@ class Search:
                 if other != name
                 and (other in rivals.get(name, ()) or _numbers(fewer.model, other) < kept.n_parameters)
             ]
-            step = self.choose(fewer, self._tried(fewer, others), with_alternatives=False)
-            best = step.taken
-            if best is not None and best.state is not None and _as_good(best, kept):
+            tried = self.choose(fewer, self._tried(fewer, others), with_alternatives=False).candidates
+            best, *alike = self._with_rivals(fewer, kept, tried)
+            if best is not kept and best.state is not None:
                 state, left = best.state, [best.name if one == name else one for one in left]
-                made.append(replace(step, rivals=(name, *step.rivals)))
-            else:
-                alike = tuple(c.name for c in step.candidates if self._rival(fewer, kept, c))
-                made.append(SearchStep(fewer, (kept, *step.candidates), kept, alike))
+            made.append(SearchStep(fewer, (kept, *tried), best, tuple(c.name for c in alike)))
         return state, left, made
 
     def bounds(self, state: ModelState) -> list[DetectionLimit]:
