@@ -73,7 +73,8 @@ def test_a_rival_is_one_beside_all_that_was_found() -> None:
     found = ["tip_spring", "creep"]
     step = SearchStep(base, (), search.judged(base, state, "tip_spring"), ("backlash", "stiffness_taper"))
     _, _, (again,) = search.again_beside_all(state, found, [step])
-    assert "stiffness_taper" in (again.taken.name, *again.rivals) if again.taken else False
+    assert again.taken is not None
+    assert "stiffness_taper" in (again.taken.name, *again.rivals)
     assert "backlash" not in again.rivals
 
 

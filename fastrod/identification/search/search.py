@@ -557,8 +557,8 @@ class Search:
         return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _with_rivals(self, state: ModelState, best: Candidate, tried: Sequence[Candidate]) -> list[Candidate]:
-        """The best, then its rivals. One with fewer numbers that does as well comes first; laws that contain
-        one another are told apart by their estimates."""
+        """The best, then its rivals. One with fewer numbers that does as well comes first; of laws that
+        contain one another the estimates decide."""
         rivals = [
             c for c in tried if c.alternative is None and c.name != best.name and self._rival(state, best, c)
         ]
