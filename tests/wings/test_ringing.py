@@ -1,6 +1,5 @@
 """Rods that ring in the viewer's worlds: by their natural frequency, until they rest; without a browser."""
 
-import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -354,11 +353,7 @@ def test_what_cannot_ring_is_one_sentence(
 def test_a_command_opens_a_robot_that_rings(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[FreeWorld] = []
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.page.world))
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        view("prototype", port=0, open_browser=False, dynamics=True, line_density=0.1, dt=2e-3)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    view("prototype", port=0, open_browser=False, dynamics=True, line_density=0.1, dt=2e-3)
     assert opened[0].dt == 2e-3
     assert opened[0].robot.segments[0].line_density == 0.1
     assert opened[0].ringing is not None

@@ -12,7 +12,7 @@ import time
 import urllib.request
 import webbrowser
 from pathlib import Path
-from subprocess import PIPE, Popen
+from subprocess import PIPE, Popen, run
 
 import pytest
 
@@ -168,6 +168,26 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
             process.kill()
 
 
+_INTERRUPTED = {
+    "crosses the text of a dataclass": "exec('kill()')",
+    "becomes a compiler's error": "try: kill()\n    except KeyboardInterrupt: raise RuntimeError('no object')",
+    "is swallowed by a callback": "ctypes.CFUNCTYPE(None)(kill)()\n    assert ending.come",
+}
+
+
+@pytest.mark.parametrize("end", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("how", _INTERRUPTED)
+def test_what_an_end_interrupts_ends_quietly(how: str, end: str) -> None:
+    code = (
+        "import ctypes, os, signal\nfrom fastrod_viewer.ending import Ending\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"def kill(): os.kill(os.getpid(), signal.{end}); sum(range(9))\n"
+        f"with Ending() as ending:\n    {_INTERRUPTED[how]}\nassert ending.come"
+    )
+    done = run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def _address() -> str:
     """Address of this machine on its network, or a loopback address that nobody serves."""
     address = socket.gethostbyname(socket.gethostname())
@@ -187,11 +207,7 @@ def test_the_address_is_the_key(host, announced, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
     monkeypatch.setattr(webbrowser, "open", browse)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        view("prototype", host=host, port=0)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    view("prototype", host=host, port=0)
     said = capsys.readouterr()
     assert list(tmp_path.iterdir()) == []
     address, key = opened

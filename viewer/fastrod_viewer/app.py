@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod_scenes.scene import names
 from fastrod_viewer.drive.page import DrivePage
+from fastrod_viewer.ending import Ending
 from fastrod_viewer.holder import Holder, HolderPanels
 from fastrod_viewer.page import ViewerPage, is_upright, notify, plain
 from fastrod_viewer.picture.canvas import Canvas
@@ -337,9 +337,7 @@ def view(
         raise InputError(f"{given} goes with --dynamics: without, nothing has inertia.")
     if dynamics and robot is not None:
         raise InputError("--robot goes with a run log, and --dynamics with a robot; give one of them.")
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
+    with Ending() as ending, App(host=host, port=port, server=server) as app:
         line = f"{_title(what)}: {app.address} (Ctrl+C ends it)"
         address = threading.Timer(_SOON, print, (line,), {"flush": True})
         address.start()  # a first world compiles for half a minute
@@ -361,4 +359,5 @@ def view(
                 f"Other machines can open this page, too, at {app.served.elsewhere} and whoever has this "
                 "address can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
-        app.wait()
+        if not ending.come:
+            app.wait()
