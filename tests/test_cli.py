@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from reportlog import backlash_log
 
-from fastrod.commands import cli
+from fastrod.commands import cli, terminal
 from fastrod.errors import InputError
 from fastrod.logs.runlog import read_log, write_log
 from fastrod.model.robot import Robot
@@ -187,7 +187,7 @@ def test_identify_takes_several_logs_and_the_default_folder(
     assert seen["names"] == ["small", "other"]
     assert [seen[name] for name in ("held_out", "max_effects", "free_camera")] == [[], 2, True]
     assert capsys.readouterr().err == "seen enough.\n"  # short work says nothing where nobody looks on
-    monkeypatch.setattr("fastrod.commands.cli._PATIENCE", 0.0)
+    monkeypatch.setattr(terminal, "_PATIENCE", 0.0)
     assert fastrod(f"identify {measured} --robot prototype --max-effects 0") == 2
     assert capsys.readouterr().err == "0 s, 0 of 4: base fit: 0.3 mm left\nseen enough.\n"
     assert seen["folder"]  # made before the long work, and gone where nothing came of it
@@ -219,7 +219,10 @@ IDENTIFY = "identify LOG --robot prototype "
 WRONG = {
     "no command": ("", MISSING + "COMMAND"),
     "unknown command": ("repaly", "no command 'repaly'; did you mean 'replay'?"),
-    "unknown option": ("demo --speed", "fastrod demo does not know '--speed'"),
+    "unknown option": ("demo --xyz", "fastrod demo does not know '--xyz'; `fastrod demo --help` lists them."),
+    "like an option": ("demo --sede=1", "fastrod demo does not know '--sede=1'; did you mean '--seed'?"),
+    "like none of all": ("--verison", "fastrod does not know '--verison'; did you mean '--version'?"),
+    "no action": ("generate --count 3", "fastrod generate needs an action; known: rollouts, shapes, sweep."),
     "no log": ("replay", MISSING + "LOG"),
     "log not there": (
         "replay none.csv --robot prototype",
@@ -304,18 +307,16 @@ def test_bench_runs_the_scripts_of_perf(tmp_path: Path, monkeypatch: Patch, caps
 
 
 def test_help_has_every_command_once(capsys: Captured) -> None:
-    from fastrod.commands.arguments import build
-
     with pytest.raises(SystemExit) as end:
         fastrod("--help")
     assert not end.value.code
     said = capsys.readouterr().out
-    parser, names = build()
+    parser = cli.build()
     commands, _, examples = (
         [line.strip() for line in half.splitlines() if line.startswith("  ")]
         for half in said.partition("examples:")
     )
-    assert sorted(line.split()[0] for line in commands) == sorted(names)
+    assert sorted(line.split()[0] for line in commands) == sorted(cli.COMMANDS)
     assert max(map(len, said.splitlines())) <= 120
     for example in examples:
         assert parser.parse_known_args(example.split("  ")[0].split()[1:])[1] == []

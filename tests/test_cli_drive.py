@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fastrod import load_robot
-from fastrod.commands.arguments import ACTIONS
+from fastrod.commands import drive
 from fastrod.commands.cli import main
 from fastrod.logs.runlog import read_log
 from fastrod_device.bench import boards, workbench
@@ -31,12 +31,12 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """`fastrod drive` with these words in an empty folder: exit code, stdout, stderr."""
+    """`fastrod drive`, or `camera`, with these words in an empty folder: exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "140")
 
     def run(*words: str) -> tuple[int, str, str]:
-        code = main(["drive", *words])
+        code = main(["camera" if {*words} & {*drive.CAMERA.functions} else "drive", *words])
         out, err = capsys.readouterr()
         return code, out, err
 
@@ -252,26 +252,26 @@ def test_pictures_that_are_collected_differ() -> None:
 
 WRONG = {
     "": "give --bus INTERFACE:CHANNEL or --emulate, and not both",
-    "fly --emulate": "no action 'fly' of fastrod drive; known: calibrate",
+    "fly --emulate": "no action 'fly' of fastrod drive; known: excite",
     "trak --emulate": "did you mean 'track'?",
     "track --emulate --bus socketcan:can0": "give --bus INTERFACE:CHANNEL or --emulate, and not both",
     "track --emulate --path hexagon": "no path 'hexagon'; known: circle, square, triangle.",
     "track --emulate --policy nowhere": "'nowhere' holds no policy",
     "track --emulate --out run.txt": "'run.txt' does not end in .csv or .parquet",
     "track --emulate --out there/run.csv": "folder 'there' is not there",
-    "track --emulate --views 3": "--views is not for track, but for calibrate, register",
+    "track --emulate --views 3": "fastrod drive track does not know '--views'",
     "track --emulate --robot prototyp": "no robot 'prototyp'; did you mean 'prototype'?",
     "track --emulate --robot tdcr_a": "there are 4 drives and robot 'tdcr_a' has 6 tendons.",
     "excite --emulate --camera 1": "--camera is for a real bench, not with --emulate",
     "excite --emulate --eds none.eds": "the EDS file none.eds cannot be read: No such file",
     "excite --bus can0": "--bus is 'can0'; give INTERFACE:CHANNEL, such as socketcan:can0.",
     "excite --bus socketcan:can0 --seed 1": "--seed is with --emulate only",
-    "excite --bus socketcan:can0 --camera none": "--camera none is for teleop alone; excite needs a camera.",
-    "loop --bus socketcan:can0 --camera none": "loop needs a camera",
-    "loop --emulate --policy shipped": "--policy is not for loop, but for track",
+    "excite --bus socketcan:can0 --camera none": "--camera none is for teleop alone; all else needs",
+    "loop --bus socketcan:can0 --camera none": "all else needs a camera",
+    "loop --emulate --policy shipped": "fastrod drive loop does not know '--policy'",
     "loop --emulate --hardware none.toml": "hardware file 'none.toml' cannot be read",
-    "teleop --emulate --out x.csv": "--out is not for teleop",
-    "calibrate --bus socketcan:can0": "--bus is not for calibrate",
+    "teleop --emulate --out x.csv": "fastrod drive teleop does not know '--out'",
+    "calibrate --bus socketcan:can0": "fastrod camera calibrate does not know '--bus'",
     "calibrate --emulate --views 4": "--views is 4; calibrate needs 5 or more.",
     "calibrate --emulate --board seven": "'seven' is not COLUMNSxROWS, such as 7x5",
     "calibrate --emulate --board 2x5": "CharucoBoard has 2 x 5 squares",
@@ -283,7 +283,7 @@ WRONG = {
     "register --emulate --at 1 2 3": "argument --at: expected 7 arguments",
     "register --emulate --at 20 0 0 1 0 0 0": "the board is more than 3 m away. Was it given in mm?",
     "register --emulate --at 0 0 0 1 1 0 0": "a quaternion w x y z of norm 1",
-    "latency --emulate --no-open": "--no-open is not for latency, but for teleop",
+    "latency --emulate --no-open": "fastrod drive latency does not know '--no-open'",
 }
 
 
@@ -324,10 +324,12 @@ def test_what_was_recorded_before_a_stop_is_told(
     assert (tmp_path / "circle.events.csv").read_text(encoding="utf-8").count("\n") > 0
 
 
-def test_help_names_every_action(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("group", ["drive", "camera"])
+def test_help_names_every_action(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["drive", "--help"])
+        main([group, "--help"])
     text = capsys.readouterr().out
     assert left.value.code == 0
-    assert all(re.search(rf"^  {name} +{re.escape(what)}$", text, re.M) for name, what in ACTIONS.items())
+    actions = (drive.DRIVE if group == "drive" else drive.CAMERA).functions
+    assert all(re.search(rf"^  {name} +\w.*$", text, re.M) for name in actions)
     assert "exit code:" in text

@@ -60,11 +60,10 @@ def test_the_page_of_scenes_has_them_all() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_on_a_page_is_one(page: Path) -> None:
     """Its words are understood; nothing of it is done."""
-    from fastrod.commands.arguments import build
+    from fastrod.commands.cli import parse
 
-    parser, _ = build()
     blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)
     commands = re.findall(r"^fastrod (.*)$", "\n".join(blocks), flags=re.M)
     lines = [line.partition("#")[0].split() for line in commands]
-    unknown = [words for words in lines if parser.parse_known_args(words)[1]]
+    unknown = [words for words in lines if parse(words)[1]]
     assert unknown == []

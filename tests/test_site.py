@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fastrod.commands.arguments import build
+from fastrod.commands.cli import build
 from fastrod.effects.base import effect_names
 from fastrod.errors import FastrodError, Problem
 from fastrod.identification.log.unknowns import MATERIAL, SEGMENT_UNITS, TENDON_UNITS
@@ -50,7 +50,7 @@ def test_site_has_every_name(site: Path) -> None:
     names["errors"] += ["SceneError", "DeviceError", "CalibrationError"]
     names["robot-file"] += [*SENSOR, *(f"segment.*.{k}" for k in SEGMENT_UNITS)]
     names["robot-file"] += [f"tendon.*.{k}" for k in TENDON_UNITS] + [f"material.{k}" for k in MATERIAL]
-    (group,) = [a for a in build()[0]._actions if isinstance(a, argparse._SubParsersAction)]
+    (group,) = [a for a in build()._actions if isinstance(a, argparse._SubParsersAction)]
     names["commands"] = [f"fastrod {name}" for name in group.choices]
     names["commands"] += [
         option

@@ -71,9 +71,8 @@ ALLOWED: dict[str, str] = {
     # names in reports, of options of environments and in policies that were trained
     "device/fastrod_device/bench/report.py": "cannot_be_told_from",
     "fastrod/identification/report/assemble.py": "cannot_be_told_from evidence",
-    "fastrod/identification/report/headline.py": "cannot_be_told_from",
     "fastrod/identification/report/motion.py": "cannot_be_told_from evidence",
-    "fastrod/identification/report/page.py": "evidence",
+    "fastrod/identification/report/page.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/report.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/result.py": "cannot_be_told_from evidence",
     "gym_envs/fastrod_envs/learning/actor.py": "reach",

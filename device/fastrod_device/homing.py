@@ -98,7 +98,7 @@ def home(
                 raise DeviceError(
                     f"the tendon of node {hardware.drives[k].node} is slack where the camera sees the robot "
                     f"straight ({tension[k]:.2f} N). "
-                    "Is the camera registered? `fastrod drive register` does it."
+                    "Is the camera registered? `fastrod camera register` does it."
                 )
     except BaseException:
         drives.quick_stop("homing did not end")
@@ -239,7 +239,7 @@ def _straightened(
             raise DeviceError(
                 f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; "
                 f"the tendons would move by {1e3 * far:.2f} "
-                f"mm, {why}; is the camera registered? `fastrod drive register` does it."
+                f"mm, {why}; is the camera registered? `fastrod camera register` does it."
             )
         before = far
         steps = max(round(far / hardware.homing_speed * hardware.rate), round(0.5 * hardware.rate))

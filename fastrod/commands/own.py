@@ -1,12 +1,11 @@
-"""`fastrod new`, `import` and `check`: a robot of one's own, and its log."""
+"""`fastrod new`, `import`, `check` and `export`: a robot of one's own, and its log."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,67 +100,37 @@ _COMMANDS = 10, 3  # that are compared with the rod, of one segment or two, and 
 _COLUMNS = ("time-column", "motor-columns", "tip-columns")
 
 
-def add_commands(commands: argparse._SubParsersAction[Any]) -> None:
-    """The arguments of these commands."""
-    new = commands.add_parser("new", help="write a robot file of your own: asks, or takes options")
-    new.add_argument("file", type=Path, metavar="FILE", help="robot file to write, .toml")
-    new.add_argument("--log", type=Path, metavar="LOG", help="your log: its columns and units are guessed")
-    new.add_argument(
-        "--markers",
-        metavar="V",
-        help="arclengths of markers on the body, in place of the tip [mm]; columns as --tip-columns",
-    )
-    new.add_argument(
-        "--marker-offset", metavar="V", default="0", help="of the markers from the axis, along x [mm]"
-    )
-    for question in (*_ROBOT, *_MATERIAL, *_FILE):
-        new.add_argument(
-            f"--{question.name}", metavar="V", help=f"{question.text} (default: {question.default})"
-        )
-    for name in _COLUMNS:
-        new.add_argument(
-            f"--{name}", metavar="NAMES", help="of the log, separated by commas (default: guessed)"
-        )
-    new.add_argument("--force", action="store_true", help="write over a file that is there")
-
-    export = commands.add_parser("export", help="a robot as a chain of joints with tendons, for MuJoCo")
-    export.add_argument("robot", metavar="ROBOT", help="a shipped robot's name or a path to a .toml")
-    export.add_argument("--mjcf", type=Path, required=True, metavar="FILE", help="file to write, .xml")
-    export.add_argument(
-        "--pieces", type=int, metavar="N", help="of a segment (default: 16, 24 of three and more)"
-    )
-
-    brings = commands.add_parser(
-        "import", help="your own log file as a run log: CSV, Parquet, MATLAB, ROS 2 bag"
-    )
-    check = commands.add_parser("check", help="is this a log of this robot, and what can it reveal?")
-    for command in (brings, check):
-        command.add_argument("log", type=Path, metavar="LOG", help="a file that [log] of the robot describes")
-        command.add_argument("--robot", required=True, metavar="R", help="a shipped robot's name or a .toml")
-    brings.add_argument(
-        "--out", type=Path, metavar="FILE", help="run log, .csv or .parquet (default: LOG_run.csv)"
-    )
-    brings.add_argument(
-        "--lerobot", type=Path, metavar="DIR", help="write a data set of LeRobot (v2.1), an episode a run"
-    )
-    brings.add_argument("--fps", type=int, default=30, metavar="N", help="with it, its rate (default: 30)")
-    check.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="write the robot with the columns and angles as matched, .toml",
-    )
+QUESTIONS = {
+    **{one.name: f"{one.text} (default: {one.default})" for one in (*_ROBOT, *_MATERIAL, *_FILE)},
+    **dict.fromkeys(_COLUMNS, "of the log, separated by commas (default: guessed)"),
+}
+"""Options of `fastrod new` beside those of its function."""
 
 
-def new(arguments: argparse.Namespace) -> int:
-    """Write a robot file; what is not given as an option is asked for on a terminal, else its default."""
-    path: Path = arguments.file
+def new(
+    file: Path,
+    *,
+    log: Path | None = None,
+    markers: str | None = None,
+    marker_offset: str = "0",
+    force: bool = False,
+    **answers: str | None,
+) -> int:
+    """Write a robot file of your own: asks, or takes options.
+
+    FILE: robot file to write, .toml
+    --log LOG: your log: its columns and units are guessed
+    --markers V: arclengths of markers on the body, in place of the tip [mm]; columns as --tip-columns
+    --marker-offset V: of the markers from the axis, along x [mm]
+    --force: write over a file that is there
+    """
+    path = file
     if path.suffix != ".toml":
         raise InputError(f"{str(path)!r} does not end in .toml; a robot file does.")
-    if path.exists() and not arguments.force:
+    if path.exists() and not force:
         raise InputError(f"{str(path)!r} is there already; --force writes over it.")
     ask = sys.stdin.isatty()
-    given = {question.name: _answer(question, arguments, ask) for question in _ROBOT}
+    given = {question.name: _answer(question, answers, ask) for question in _ROBOT}
     segments = given["segments"]
     for name in ("tendons", "length", "offset", "angle"):
         values = given[name]
@@ -170,87 +139,105 @@ def new(arguments: argparse.Namespace) -> int:
                 f"--{name} has {len(values)} numbers; give one, or one for each of {segments} segments."
             )
         given[name] = values * segments if len(values) == 1 else values
-    given["markers"] = _positive(arguments.markers) if arguments.markers else []
-    beside = _numbers(arguments.marker_offset)
+    given["markers"] = _positive(markers) if markers else []
+    beside = _numbers(marker_offset)
     given["beside"] = beside * len(given["markers"]) if len(beside) == 1 else beside
     if given["drive"] == "force":
-        given |= {question.name: _answer(question, arguments, ask) for question in _MATERIAL}
+        given |= {question.name: _answer(question, answers, ask) for question in _MATERIAL}
     text = _robot_text(path.stem, given)
-    if arguments.log is not None:
-        text += _log_text(read_table(arguments.log), arguments, given, ask)
+    if log is not None:
+        text += _log_text(read_table(log), answers, given, ask)
     loads(text, str(path))  # what is written can be read
     path.write_text(text, encoding="utf-8")
-    log = arguments.log or "LOG"
-    print(f"wrote {path}; now: fastrod check {log} --robot {path}")
+    print(f"wrote {path}; now: fastrod check {log or 'LOG'} --robot {path}")
     return 0
 
 
-def bring(arguments: argparse.Namespace) -> int:
-    """Write a run log from a user's own file."""
+def bring(
+    log: Path, *, robot: str, out: Path | None = None, lerobot: Path | None = None, fps: int = 30
+) -> int:
+    """Your own log file as a run log: CSV, Parquet, MATLAB, ROS 2 bag.
+
+    LOG: a file that [log] of the robot describes
+    --robot R: a shipped robot's name or a .toml
+    --out FILE: run log, .csv or .parquet (default: LOG_run.csv)
+    --lerobot DIR: write a data set of LeRobot (v2.1), an episode a run
+    --fps N: with it, its rate
+    """
     from fastrod.loading import load_robot
     from fastrod.logs.runlog import read_log, write_log
 
-    robot = load_robot(arguments.robot)
-    if arguments.lerobot is not None:
+    its = load_robot(robot)
+    if lerobot is not None:
         from fastrod.logs.lerobot import write_lerobot
 
-        log, task = read_log(arguments.log, robot), f"move {robot.name}"
-        made = write_lerobot(log, arguments.lerobot, robot=robot.name, fps=arguments.fps, task=task)
-        print(f"wrote {arguments.lerobot}: {made[0]} episodes, {made[1]} frames")
+        read, task = read_log(log, its), f"move {its.name}"
+        made = write_lerobot(read, lerobot, robot=its.name, fps=fps, task=task)
+        print(f"wrote {lerobot}: {made[0]} episodes, {made[1]} frames")
         return 0
-    if not robot.log.columns:
+    if not its.log.columns:
         raise InputError(
-            f"robot {robot.name!r} has no [log] columns, which say what stands where in "
-            f"{arguments.log.name}; fastrod new --log writes them."
+            f"robot {its.name!r} has no [log] columns, which say what stands where in "
+            f"{log.name}; fastrod new --log writes them."
         )
-    path: Path = arguments.out or Path(f"{arguments.log.stem}_run.csv")
+    path = out or Path(f"{log.stem}_run.csv")
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{str(path)!r} does not end in .csv or .parquet; a run log does.")
     # a clock is the robot's, and applies to its run logs too
-    log = read_log(arguments.log, replace(robot, log=replace(robot.log, clock=0.0)))
-    write_log(log, path)
-    print(f"wrote {path}: {len(log)} rows, {robot.n_tendons} tendons")
+    read = read_log(log, replace(its, log=replace(its.log, clock=0.0)))
+    write_log(read, path)
+    print(f"wrote {path}: {len(read)} rows, {its.n_tendons} tendons")
     return 0
 
 
-def export(arguments: argparse.Namespace) -> int:
-    """Write a robot as MJCF, with its static error against the rod."""
+def export(robot: str, *, mjcf: Path, pieces: int | None = None) -> int:
+    """A robot as a chain of joints with tendons, for MuJoCo.
+
+    ROBOT: a shipped robot's name or a path to a .toml
+    --mjcf FILE: file to write, .xml; it says the static error against the rod
+    --pieces N: of a segment (default: 16, 24 of three and more)
+    """
     from importlib.util import find_spec
 
-    from fastrod.hosts.mjcf import mjcf, static_error
+    from fastrod.hosts.mjcf import mjcf as written
+    from fastrod.hosts.mjcf import static_error
     from fastrod.loading import load_robot
 
-    robot, pieces = load_robot(arguments.robot), arguments.pieces
-    if arguments.mjcf.suffix != ".xml":
-        raise InputError(f"{str(arguments.mjcf)!r} does not end in .xml; a file of MuJoCo does.")
+    its = load_robot(robot)
+    if mjcf.suffix != ".xml":
+        raise InputError(f"{str(mjcf)!r} does not end in .xml; a file of MuJoCo does.")
     if pieces is not None and not 4 <= pieces <= 200:
         raise InputError(f"--pieces is {pieces}; give a whole number from 4 to 200.")
-    mjcf(robot, pieces=pieces)  # refuses before anything is computed
+    written(its, pieces=pieces)  # refuses before anything is computed
     said = "static error not measured: MuJoCo is not installed"
     if find_spec("mujoco") is not None:
-        count = _COMMANDS[robot.n_segments > 2]
-        error = static_error(robot, pieces=pieces, count=count)
+        count = _COMMANDS[its.n_segments > 2]
+        error = static_error(its, pieces=pieces, count=count)
         said = (
             f"at rest the tip is within {100.0 * error:.2g} % of the length of where fastrod has it, the "
             f"worst of {count} random commands"
         )
-    arguments.mjcf.write_text(mjcf(robot, pieces=pieces, comment=f"robot {robot.name} by fastrod; {said}"))
-    print(f"wrote {arguments.mjcf}; {said}")
+    mjcf.write_text(written(its, pieces=pieces, comment=f"robot {its.name} by fastrod; {said}"))
+    print(f"wrote {mjcf}; {said}")
     return 0
 
 
-def check(arguments: argparse.Namespace) -> int:
-    """Print what a first look says; 2 where nothing can be identified."""
+def check(log: Path, *, robot: str, out: Path | None = None) -> int:
+    """Is this a log of this robot, and what can it reveal?
+
+    LOG: a file that [log] of the robot describes
+    --robot R: a shipped robot's name or a .toml
+    --out FILE: write the robot with the columns and angles as matched, .toml
+    """
     from rich.console import Console
 
-    from fastrod.identification.log.check import LogCheck
     from fastrod.identification.log.check import check as look
     from fastrod.loading import load_robot
     from fastrod.logs.runlog import read_log
     from fastrod.model.robotfile import save_robot
 
-    robot = load_robot(arguments.robot)
-    found: LogCheck = look(read_log(arguments.log, robot), robot)
+    its = load_robot(robot)
+    found = look(read_log(log, its), its)
     console = Console()
 
     def line(name: str, text: str) -> None:
@@ -258,15 +245,15 @@ def check(arguments: argparse.Namespace) -> int:
 
     for name, text in found.facts.items():
         line(name, text)
-    for label, lines in (("shows", found.shows), ("lacks", found.lacks), ("asks", found.questions)):
-        for text in lines:
+    for label, texts in (("shows", found.shows), ("lacks", found.lacks), ("asks", found.questions)):
+        for text in texts:
             line(label, text)
     if found.columns is not None:
         console.print(_mapping(found), highlight=False)
-    if arguments.out is not None:
-        save_robot(found.robot, arguments.out)
-        line("wrote", str(arguments.out))
-    if found.refusal and arguments.out is None:
+    if out is not None:
+        save_robot(found.robot, out)
+        line("wrote", str(out))
+    if found.refusal and out is None:
         raise LogError(found.refusal)
     if not found.refusal and not found.questions and found.columns is None:
         line("ok", "units, signs, order, clock and time fit the robot")
@@ -303,9 +290,9 @@ def _mapping(found: Any) -> Any:
     return grid
 
 
-def _answer(question: _Question, arguments: argparse.Namespace, ask: bool, guess: str = "") -> Any:
+def _answer(question: _Question, answers: Mapping[str, str | None], ask: bool, guess: str = "") -> Any:
     """The value of a question: given as an option, typed, or its default."""
-    given = getattr(arguments, question.name.replace("-", "_"))
+    given = answers.get(question.name.replace("-", "_"))
     default = guess or question.default
     while True:
         typed = given
@@ -391,7 +378,7 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any], ask: bool) -> str:
+def _log_text(table: Table, answers: Mapping[str, str | None], given: dict[str, Any], ask: bool) -> str:
     """`[log]` for the columns of a user's file, guessed where they are not given."""
     count = sum(given["tendons"])
     n_markers = len(given["markers"])
@@ -399,7 +386,7 @@ def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any]
     names: dict[str, list[str]] = {}
     for key, wanted in zip(_COLUMNS, (1, count, 3 * max(n_markers, 1)), strict=True):
         question = _Question(key, f"{key.replace('-', ' ')} of the log", ",".join(guess[key]), str)
-        found = [word.strip() for word in _answer(question, arguments, ask).split(",") if word.strip()]
+        found = [word.strip() for word in _answer(question, answers, ask).split(",") if word.strip()]
         if len(found) != wanted:
             how = " (guessed)" if found == guess[key] else ""
             raise InputError(f"--{key} has {len(found)} names{how}; it needs {wanted} of {', '.join(table)}.")
@@ -410,7 +397,7 @@ def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any]
     for question, key in zip(_FILE[:3], ("time-column", "tip-columns", "motor-columns"), strict=True):
         said = _UNIT.search(names[key][0])
         unit = _spelt(said[1]) if said else _by_size(question.name, table, names[key], given)
-        units[question.name] = _answer(question, arguments, ask, unit)
+        units[question.name] = _answer(question, answers, ask, unit)
     angular, forces = units["motor-unit"] in UNITS["angle"], given["drive"] == "force"
     if forces != (units["motor-unit"] in UNITS["force"]):
         raise InputError(
@@ -439,9 +426,9 @@ def _log_text(table: Table, arguments: argparse.Namespace, given: dict[str, Any]
     if forces:
         return "\n".join([*lines, ""])
     if angular:
-        radii = _answer(_FILE[3], arguments, ask)
+        radii = _answer(_FILE[3], answers, ask)
         lines.append(f"drum_radius = {1e-3 * radii[0]:.6g}  # m")
-    pulls = _answer(_FILE[4], arguments, ask) == "pulls"
+    pulls = _answer(_FILE[4], answers, ask) == "pulls"
     lines.append(f"sign = {-1 if pulls else 1}  # -1: a positive value pulls")
     return "\n".join([*lines, ""])
 

@@ -314,9 +314,9 @@ def signature(name: str) -> str:
 
 def commands() -> None:
     """Every command with its options."""
-    from fastrod.commands.arguments import build
+    from fastrod.commands.cli import build
 
-    parser, _ = build()
+    parser = build()
     (group,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     text = ["# Commands"]
     helps = {action.dest: action.help or "" for action in group._choices_actions}

@@ -26,8 +26,8 @@ OF_WHAT = "rollouts are of an environment or of a robot's own motion; give --env
 COMMANDS = {
     f"{SHAPES} --count 1e6.5": f"argument --count: '1e6.5' {NO_WHOLE}",
     f"{SHAPES} --count 0.5": f"argument --count: '0.5' {NO_WHOLE}",
-    f"{SHAPES} --foo": (
-        "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` lists them."
+    f"{SHAPES} --xyz": (
+        "fastrod generate shapes does not know '--xyz'; `fastrod generate shapes --help` lists them."
     ),
     f"{SHAPES} --count 0": "count is 0; it must be a whole number from 1 to 1000000000000.",
     f"{SHAPES} --seed -1": "seed is -1; it must be a whole number from 0 to 9223372036854775808.",
@@ -35,8 +35,8 @@ COMMANDS = {
     f"{SHAPES} --workers 0": "workers is 0; it must be a whole number from 1 to 4096.",
     f"{SHAPES} --force -1": "--force is -1.0 N; it must be zero or positive.",
     f"{SHAPES} --robot protoype": "no robot 'protoype'; did you mean 'prototype'? A path must end in .toml.",
-    SHAPES.replace("shapes", "shape"): "no data set 'shape' to generate; did you mean 'shapes'?",
-    "xyz": "no data set 'xyz' to generate; known: rollouts, shapes, sweep.",
+    SHAPES.replace("shapes", "shape"): "no action 'shape' of fastrod generate; did you mean 'shapes'?",
+    "xyz": "no action 'xyz' of fastrod generate; known: rollouts, shapes, sweep.",
     "rollouts --seed 0": OF_WHAT,
     "rollouts --env Reach --robot prototype": OF_WHAT,
     "rollouts --robot prototype --policy random": (

@@ -19,7 +19,6 @@ from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.split import split, thinned
 from fastrod.identification.report import report
 from fastrod.identification.report.assemble import Explained
-from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Error, Result
 from fastrod.identification.search import search
@@ -148,7 +147,7 @@ def test_a_short_log_claims_no_shares(seconds: float) -> None:
     log = found("gravity").log
     result = replace(found("gravity"), log=replace(log, t=log.t * seconds / np.ptp(log.t)))
     assert result.knows_fractions == (seconds > 10.0)
-    assert math.isfinite(explained(result)) == (seconds > 10.0)
+    assert math.isfinite(result.explained_fraction) == (seconds > 10.0)
     said = page(result)
     assert ("The residual's variance" in said) == (seconds > 10.0)
     assert ("too short to say which share" in said) == (seconds < 10.0)

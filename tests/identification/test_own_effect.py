@@ -17,7 +17,7 @@ from fastrod.effects import base
 from fastrod.effects.base import Signal, effect_names, get_effect, signal_of, trait
 from fastrod.identification.log.advice import separating_run
 from fastrod.identification.log.unknowns import effect_unknowns
-from fastrod.identification.report.headline import _found
+from fastrod.identification.report.page import _would_show
 from fastrod.identification.report.result import Found
 from fastrod.identification.report.signals import Signals
 from fastrod.identification.search.model_selection import DetectionLimit
@@ -107,7 +107,7 @@ def test_a_report_draws_it_against_its_signal(package: None) -> None:
 def test_its_bound_is_among_the_first(package: None) -> None:
     bounds = [DetectionLimit(name, "rate", "1/s", 0.1) for name in (*effect_names()[:8], "worn_cable")]
     result: Any = SimpleNamespace(effects=[], patterns=[], verdict="none", bounds=bounds)
-    assert "worn cable" in _found(result).lower()
+    assert any("worn cable" in sentence for sentence in _would_show(result))
 
 
 def test_every_law_of_the_library_has_what_it_had() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from benches import BusBench, Springs
 
-from fastrod.commands.drive import _bench
+from fastrod.commands.drive import _bench, _Drives
 from fastrod.errors import InputError
 from fastrod_device.can.dictionary import NEEDED, find, object_dictionary, read_eds
 from fastrod_device.errors import DeviceError
@@ -282,8 +281,7 @@ def test_what_is_not_limited_is_printed_and_in_the_journal(tmp_path, capsys, wri
     pytest.importorskip(
         "cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'"
     )
-    given = {"seed": 1, "eds": write(without(0x607F)), "bus": None, "camera": None}
-    options = Namespace(emulate=True, no_home=True, real_time=False, **given)
+    options = _Drives(emulate=True, no_home=True, seed=1, eds=write(without(0x607F)))
     with _bench(options, load_hardware(), journal=tmp_path / "run.csv") as made:
         lacks = "has no object 0x607F: the profile velocity is not limited."
         says = [f"Node {node} {lacks}" for node in range(1, 5)]

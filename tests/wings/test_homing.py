@@ -201,7 +201,7 @@ def test_a_blocked_drive_is_the_one_that_is_blamed(drive, phase, rig, monkeypatc
 @pytest.mark.study
 def test_a_camera_that_stands_elsewhere_pulls_no_tendon(rig):
     rig.moved = lambda position: position + np.array([0.025, 0.0, 0.0])
-    beside = "the tip is seen 25 mm beside the axis; .* 1 mm at most; .*`fastrod drive register`"
+    beside = "the tip is seen 25 mm beside the axis; .* 1 mm at most; .*`fastrod camera register`"
     with pytest.raises(DeviceError, match=beside):
         rig.home()
     rig.rest()

@@ -170,7 +170,7 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
 
 _INTERRUPTED = {
     "crosses the text of a dataclass": "exec('kill()')",
-    "becomes a compiler's error": "try: kill()\n    except KeyboardInterrupt: raise RuntimeError('no object')",
+    "becomes a compiler's error": "try: kill()\n    except KeyboardInterrupt: raise RuntimeError('none')",
     "is swallowed by a callback": "ctypes.CFUNCTYPE(None)(kill)()\n    assert ending.come",
 }
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fastrod.identification.log.registration import CameraRegistration
-from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Error, Result
 from fastrod.identification.report.wording import (
@@ -198,7 +197,7 @@ def table(result: Result) -> Group:
                     escape(note),
                 )
                 label = ""
-        fraction = explained(result)
+        fraction = result.explained_fraction
         if math.isfinite(fraction):
             grid.caption = f"{percent(max(fraction, 0.0))} of the held-out error above the noise is explained"
             grid.caption_justify = "left"

@@ -192,6 +192,15 @@ class Result:
         return math.isfinite(self.test.interval[0]) and float(np.ptp(self.log.t)) >= SHORT
 
     @property
+    def explained_fraction(self) -> float:
+        """Share of the held-out error above the noise that is gone; nan where there was none."""
+        floor = self.noise.floor**2
+        excess = self.test.before**2 - floor
+        if excess <= 0.03 * floor or not self.knows_fractions:
+            return math.nan
+        return min(1.0, (self.test.before**2 - self.test.after**2) / excess)
+
+    @property
     def residual_before(self) -> Floats:
         """(n, 3) measured - predicted [m]; nan where nothing was measured."""
         return np.asarray(self.log.tip_position - self.before)

@@ -1,10 +1,12 @@
-"""Training presets of each task: algorithm, batch, steps, and the options of its environments."""
+"""Training presets of each task, as presets.toml has them, and the settings of an algorithm."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any
 
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
@@ -32,35 +34,12 @@ class Preset:
     """Settings of the algorithm."""
 
 
-_ROBOTS: Mapping[str, Any] = {
-    "backlash.half_width": (0.0, 4e-4),
-    "friction.half_width": (0.0, 3e-4),
-    "drum_gain.gain": (-0.1, 0.1),
-    "latency.delay": (0.0, 0.1),
-    "gravity.line_density": (0.0, 0.3),
-    "creep.share": (0.0, 0.1),
-    "tendon_stretch.compliance": (0.0, 5e-4),
-    "stiffening.cubic": (-0.1, 0.1),
-}
-"""Effects of a prototype that may be: what Track is trained on."""
-
-_PRESETS: Mapping[str, Preset] = {
-    "Reach": Preset(n_envs=512, steps=3_000_000, options={"reward": "precise"}),
-    "ReachObstacle": Preset(n_envs=512, steps=4_000_000, options={"reward": "precise"}),
-    "Catch": Preset(n_envs=256, steps=500_000, imitate=50_000),
-    "TubeInsert": Preset(n_envs=32, steps=0, imitate=24_000),
-    "Push": Preset(n_envs=8, steps=0, imitate=24_000),
-    "QuadrupedPush": Preset(n_envs=8, steps=0, imitate=12_000),
-    "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
-    "PickPlace": Preset(n_envs=8, steps=0, imitate=40_000),
-    "DualArm": Preset(n_envs=8, steps=0, imitate=12_000),
-    "Track": Preset(
-        n_envs=128,
-        steps=1_000_000,
-        imitate=100_000,
-        options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}},
-    ),
-}
+_FILE = tomllib.loads((files("fastrod_envs.learning") / "presets.toml").read_text(encoding="utf-8"))
+_PRESETS: Mapping[str, Preset] = {name: Preset(**table) for name, table in _FILE["preset"].items()}
+_Range = tuple[str, float, float]
+_SETTINGS: Mapping[str, Mapping[str, _Range]] = _FILE["settings"]
+"""Settings of each algorithm of stable-baselines3 that a command line can give: kind, least and largest
+value."""
 
 
 def preset_of(env: str) -> Preset:
@@ -107,63 +86,9 @@ def settings_of(
     return {**common, **own, **given}
 
 
-_Range = tuple[type, float, float]
-_COMMON: Mapping[str, _Range] = {
-    "learning_rate": (float, 0.0, 1.0),
-    "gamma": (float, 0.0, 1.0),
-    "batch_size": (int, 1, 1e8),
-    "stats_window_size": (int, 1, 1e6),
-}
-_EXPLORING: Mapping[str, _Range] = {"use_sde": (bool, 0, 1), "sde_sample_freq": (int, -1, 1e9)}
-_OFF_POLICY: Mapping[str, _Range] = {
-    "buffer_size": (int, 1, 1e9),
-    "learning_starts": (int, 0, 1e12),
-    "tau": (float, 0.0, 1.0),
-    "train_freq": (int, 1, 1e9),
-    "gradient_steps": (int, -1, 1e6),
-    "n_steps": (int, 1, 1e4),
-    "optimize_memory_usage": (bool, 0, 1),
-}
-_SETTINGS: Mapping[str, Mapping[str, _Range]] = {
-    "ppo": {
-        **_COMMON,
-        **_EXPLORING,
-        "n_steps": (int, 2, 1e6),
-        "batch_size": (int, 2, 1e8),
-        "n_epochs": (int, 1, 1e4),
-        "gae_lambda": (float, 0.0, 1.0),
-        "clip_range": (float, 1e-9, 1e3),
-        "clip_range_vf": (float, 1e-9, 1e9),
-        "normalize_advantage": (bool, 0, 1),
-        "ent_coef": (float, 0.0, 1e3),
-        "vf_coef": (float, 0.0, 1e3),
-        "max_grad_norm": (float, 1e-9, 1e9),
-        "target_kl": (float, 1e-9, 1e9),
-    },
-    "sac": {
-        **_COMMON,
-        **_EXPLORING,
-        **_OFF_POLICY,
-        "ent_coef": (float, 0.0, 1e3),
-        "target_update_interval": (int, 1, 1e9),
-        "target_entropy": (float, -1e6, 1e6),
-        "use_sde_at_warmup": (bool, 0, 1),
-    },
-    "td3": {
-        **_COMMON,
-        **_OFF_POLICY,
-        "policy_delay": (int, 1, 1e6),
-        "target_policy_noise": (float, 0.0, 1e3),
-        "target_noise_clip": (float, 0.0, 1e3),
-    },
-}
-"""Settings of each algorithm of stable-baselines3 that a command line can give: kind, least and largest
-value; 0 is no learning rate."""
 _WORDS: Mapping[str, str] = {"ent_coef": "auto", "target_entropy": "auto"}
 """Settings of SAC by name: a word that is as good as a number."""
 _NONE = ("clip_range_vf", "target_kl")
-_POLICY: Mapping[str, _Range] = {"log_std_init": (float, -20.0, 20.0), "n_critics": (int, 1, 100)}
-"""Numbers of policy_kwargs."""
 _DEEPEST, _WIDEST = 16, 4096  # layers of a network and their width: 1 GB of weights
 _SYNONYMS: Mapping[str, str] = {
     "lr": "learning_rate",
@@ -206,22 +131,23 @@ def _check_policy(algorithm: str, given: Mapping[str, Any]) -> None:
                 f"setting 'net_arch' of {algorithm} is {shown(net)}; it must be a list of at most {_DEEPEST} "
                 f"whole numbers from 1 to {_WIDEST}, the widths of its layers."
             )
-    for name in _POLICY.keys() & given.keys():
-        _check_range(algorithm, name, given[name], _POLICY[name])
+    known = _SETTINGS["policy_kwargs"]
+    for name in known.keys() & given.keys():
+        _check_range(algorithm, name, given[name], known[name])
 
 
 def _check_range(algorithm: str, name: str, value: Any, allowed: _Range) -> None:
     kind, least, most = allowed
     right = (
         isinstance(value, bool)
-        if kind is bool
-        else isinstance(value, (int, kind)) and not isinstance(value, bool)
+        if kind == "bool"
+        else isinstance(value, int if kind == "int" else (int, float)) and not isinstance(value, bool)
     )
     if not right or not least <= value <= most or (name == "learning_rate" and value == 0.0):
         what = {
-            bool: "true or false",
-            int: f"a whole number from {least:g} to {most:g}",
-            float: f"a number from {least:g} to {most:g}",
+            "bool": "true or false",
+            "int": f"a whole number from {least:g} to {most:g}",
+            "float": f"a number from {least:g} to {most:g}",
         }
         above = ", above 0" if name == "learning_rate" else ""
         raise InputError(
