@@ -105,8 +105,9 @@ def add_command(commands: Any, name: str, function: Command, more: Mapping[str, 
 
 def unknown_option(parser: argparse.ArgumentParser, word: str) -> UsageError:
     """The error for an option that a command does not have."""
-    near = difflib.get_close_matches(word.partition("=")[0], parser._option_string_actions, n=1)
-    meant = f" did you mean {near[0]!r}?" if near else ""
+    known = [option.lstrip("-") for option in parser._option_string_actions]
+    near = difflib.get_close_matches(word.partition("=")[0].lstrip("-"), known, n=1)
+    meant = f" did you mean '--{near[0]}'?" if near else ""
     return UsageError(f"{parser.prog} does not know {word!r};{meant} `{parser.prog} --help` lists them.")
 
 
