@@ -16,12 +16,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
+import jinja2
 import matplotlib as mpl
 import matplotlib.image
 import mkdocs_gen_files
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    autoescape=False,  # Markdown, of our own docstrings
+    trim_blocks=True,
+    undefined=jinja2.StrictUndefined,
+)
 PAGES = {
     "README.md": "index.md",
     "fastrod/README.md": "rod.md",
@@ -136,6 +143,11 @@ def keys_of(kind: type) -> str:
     return rows(("key", "meaning", "default"), body)
 
 
+def fill(template: str, place: str, **given: Any) -> None:
+    """One page of the site, from a template beside this file."""
+    write(place, TEMPLATES.get_template(f"{template}.md.j2").render(**given))
+
+
 def robot_file() -> None:
     """Every key of a robot file."""
     from fastrod.commands.own import _robot_text
@@ -143,10 +155,6 @@ def robot_file() -> None:
     from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS
     from fastrod.model.robotfile import SENSOR
 
-    text = [
-        "# Robot file",
-        "A robot is a TOML file. `fastrod new mine.toml` asks for the numbers and writes one.",
-    ]
     given = {
         "segments": 1,
         "tendons": [3],
@@ -155,120 +163,79 @@ def robot_file() -> None:
         "angle": [0.0],
         "drive": "pull",
     }
-    text += [f"```toml\n{_robot_text('mine', given).strip()}\n```"]
-    for name, (title, module) in SECTIONS.items():
-        kind = getattr(importlib.import_module(module), name)
-        first = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("\n", " ")
-        text += [f"## {title}", first, keys_of(kind)]
-        if name == "LogFormat":
-            more = [("`points`", "arclengths of the measured points p1 ... pk [m]")]
-            more += [("`point_offsets`", "where these lie beside the backbone, along d1 and d2 [m]")]
-            text += [rows(("key beside these", "meaning"), more)]
-    text += [
-        "A segment with two numbers in `body_radius`, at its base and its end, tapers; a tendon with one more"
+    kinds = [
+        (title, getattr(importlib.import_module(module), name)) for name, (title, module) in SECTIONS.items()
     ]
-    text += ["`offset` than it crosses segments lies on a cone. Such a segment becomes ten even pieces."]
-    others = [
-        ("`[base] position`", "of the base, world frame [m]", "`[0, 0, 0]`"),
-        ("`[base] quaternion`", "world_from_base, w x y z; z is the rod's first tangent", "`[1, 0, 0, 0]`"),
-        ("`[world] gravity`", "world frame [m/s^2]", "`[0, 0, -9.81]`"),
-        ("`[[effect]]`", "`name` and the parameters of an effect (see Effects)", ""),
-    ]
-    text += ["## Base, world and effects", rows(("key", "meaning", "default"), others)]
-    text += ["## [sensor]", rows(("key", "meaning"), [(f"`{k}`", v) for k, v in SENSOR.items()])]
     targets = [(f'`"segment.*.{k}"`', unit) for k, unit in SEGMENT_UNITS.items()]
     targets += [(f'`"tendon.*.{k}"`', unit or "1") for k, unit in TENDON_UNITS.items()]
-    targets += [('`"segment.1.lump.1.mass"`', "kg")] + [
-        (f'`"material.{k}"`', "factor, or fraction") for k in OF_ALL
-    ]
-    text += [
-        "## [fit]",
-        "What is not known exactly, with the standard deviation of its prior. `*` stands for",
-    ]
-    text += [
-        "every segment or tendon; a number names one, from 1 on; `shared = true` fits one number for all."
-    ]
-    text += ["```toml", "[fit]", '"segment.1.length" = { sd = 0.01 }', "```"]
-    text += [rows(("target", "unit of sd"), targets)]
-    write("robot-file.md", "\n\n".join(text).replace("\n\nevery segment", "\nevery segment"))
+    targets += [('`"segment.1.lump.1.mass"`', "kg")]
+    targets += [(f'`"material.{k}"`', "factor, or fraction") for k in OF_ALL]
+    fill(
+        "robot-file",
+        "robot-file.md",
+        example=_robot_text("mine", given).strip(),
+        sections=[(title, first_of(kind), keys_of(kind)) for title, kind in kinds],
+        sensor=rows(("key", "meaning"), [(f"`{k}`", v) for k, v in SENSOR.items()]),
+        targets=rows(("target", "unit of sd"), targets),
+    )
+
+
+def first_of(kind: Any) -> str:
+    """The first paragraph of a docstring."""
+    return (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("\n", " ")
 
 
 def run_log() -> None:
     """Every column of a run log, and how a file of one's own is translated."""
     from fastrod.model.logformat import COLUMNS, UNITS
 
-    text = [
-        "# Run log",
-        "A run log is a CSV or Parquet file with these columns, in SI. Your own file needs no",
-    ]
-    text[1] += " converter: `[log]` of the robot file says what stands where."
-    text += [rows(("column", "meaning"), [(f"`{k}`", v) for k, v in COLUMNS.items()])]
-    text += ["## Units of your own file"]
-    text += [
-        rows(("kind", "units"), [(kind, ", ".join(f"`{u}`" for u in known)) for kind, known in UNITS.items()])
-    ]
-    text += ["```toml", "[log]", 'columns.t = "time_ms"', 'columns.dl = ["m1_deg", "m2_deg", "m3_deg"]']
-    text += ['columns.tip = ["X", "Y", "Z"]', 'units = { time = "ms", angle = "deg", length = "mm" }']
-    text += ["drum_radius = 0.012", "sign = -1", "```"]
-    body = "\n\n".join(text[:-8]) + "\n\n" + "\n".join(text[-8:])
-    write("run-log.md", body)
+    units = [(kind, ", ".join(f"`{u}`" for u in known)) for kind, known in UNITS.items()]
+    columns = [(f"`{k}`", v) for k, v in COLUMNS.items()]
+    tables = {"columns": rows(("column", "meaning"), columns), "units": rows(("kind", "units"), units)}
+    fill("run-log", "run-log.md", **tables)
 
 
 def effects() -> None:
     """A page for every effect: its law, its parameters, what shows it, and what it does to the tip."""
+    from fastrod import load_robot
     from fastrod.effects.base import effect_names, get_effect, trait
     from fastrod.identification.report.wording import law, words
+    from fastrod.model.routing import route
 
-    listed = []
+    listed, routing = [], route(load_robot("tdcr_b"))
+    head = ("parameter", "unit", "without effect", "range", "one for each")
     for name in sorted(effect_names()):
         what = get_effect(name)
-        first = (inspect.getdoc(type(what)) or "").partition("\n\n")[0].replace("\n", " ")
-        listed.append((f"[{words(name)}](effects/{name}.md)", first, what.seam.name.lower()))
-        text = [f"# {words(name).capitalize()}", first]
-        text += [f"**{key}.** {value}" for key, value in law(name).items()]
-        parameters = [
+        listed.append((f"[{words(name)}](effects/{name}.md)", first_of(type(what)), what.seam.name.lower()))
+        body = [
             (f"`{p.name}`", p.unit or "1", f"{p.neutral:g}", f"{p.bounds[0]:g} to {p.bounds[1]:g}", p.per)
             for p in what.parameters
         ]
-        text += ["## In a robot file", _example(name)]
-        text += [rows(("parameter", "unit", "without effect", "range", "one for each"), parameters)]
-        if any(p.of for p in what.parameters):
-            text += ["Ranges of lengths are multiples of the tendon's offset."]
-        shown = trait(what, "excited_by")
-        text += ["## In a log", f"Motion that shows it: {shown}." if shown else ""]
-        alike = trait(what, "confounded_with")
         apart = trait(what, "separated_by")
-        if alike:
-            body = [
-                (
-                    f"[{words(other)}]({other}.md)",
-                    apart.get(other) or trait(get_effect(other), "separated_by").get(name, ""),
-                )
-                for other in alike
-            ]
-            text += [rows(("alike in many logs", "run that separates them"), body)]
-        if also := trait(what, "synonyms"):
-            text += [f"Other names: {', '.join(f'`{each}`' for each in also)}."]
+        alike = [
+            (f"[{words(k)}]({k}.md)", apart.get(k) or trait(get_effect(k), "separated_by").get(name, ""))
+            for k in trait(what, "confounded_with")
+        ]
         if picture := signature(name):
-            text += [f"![Motion of the tip by {words(name)} over one bend that swings]({name}.svg)"]
-            with mkdocs_gen_files.open(f"effects/{name}.svg", "w") as file:
-                file.write(picture)
-        write(f"effects/{name}.md", "\n\n".join(filter(None, text)))
-    head = (
-        "# Effects\n\nWhat a real robot does and an ideal model does not. `fastrod identify` tries each.\n\n"
-    )
-    write("effects.md", head + rows(("effect", "", "seam"), listed))
-
-
-def _example(name: str) -> str:
-    """An effect in a robot file, at the numbers where a fit begins."""
-    from fastrod import load_robot
-    from fastrod.effects.base import get_effect
-    from fastrod.model.routing import route
-
-    every = [p.on(route(load_robot("tdcr_b"))) for p in get_effect(name).parameters]
-    lines = [f"{p.name} = {p.starts[0]:.2g}{f'  # {p.unit}' if p.unit else ''}" for p in every]
-    return "\n".join(["```toml", "[[effect]]", f'name = "{name}"', *lines, "```"])
+            write(f"effects/{name}.svg", picture)
+        fill(
+            "effect",
+            f"effects/{name}.md",
+            name=name,
+            words=words(name),
+            title=words(name).capitalize(),
+            first=first_of(type(what)),
+            law=law(name),
+            typical=[p.on(routing) for p in what.parameters],
+            parameters=rows(head, body),
+            by_offset=any(p.of for p in what.parameters),
+            excited_by=trait(what, "excited_by"),
+            alike=rows(("alike in many logs", "run that separates them"), alike) if alike else "",
+            synonyms=trait(what, "synonyms"),
+            pictured=bool(picture),
+        )
+    about = "What a real robot does and an ideal model does not. `fastrod identify` tries each."
+    write("effects.md", f"# Effects\n\n{about}\n\n{rows(('effect', '', 'seam'), listed)}")
 
 
 def signature(name: str) -> str:
@@ -316,19 +283,16 @@ def commands() -> None:
     """Every command with its options."""
     from fastrod.commands.cli import build
 
-    parser = build()
-    (group,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    text = ["# Commands"]
-    helps = {action.dest: action.help or "" for action in group._choices_actions}
-    for name, command in group.choices.items():
-        text += [f"## fastrod {name}", f"{helps.get(name, '').capitalize()}."]
-        options = _options(command)
-        for action in command._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for inner, each in action.choices.items():
-                    options += [(f"{inner} {flag}", what) for flag, what in _options(each)]
-        text += [rows(("option", "meaning"), options)]
-    write("commands.md", "\n\n".join(text))
+    (group,) = [a for a in build()._actions if isinstance(a, argparse._SubParsersAction)]
+    made = []
+    for action in group._choices_actions:
+        options = _options(command := group.choices[action.dest])
+        for each in command._actions:
+            if isinstance(each, argparse._SubParsersAction):
+                for inner, parser in each.choices.items():
+                    options += [(f"{inner} {flag}", what) for flag, what in _options(parser)]
+        made.append((action.dest, (action.help or "").capitalize(), rows(("option", "meaning"), options)))
+    fill("commands", "commands.md", commands=made)
 
 
 def _options(command: argparse.ArgumentParser) -> list[tuple[str, str]]:
@@ -455,15 +419,11 @@ def errors() -> None:
     problems = [
         (f"`{p.name}`", text) for p, text in zip(every.Problem, _after_members(every.Problem), strict=True)
     ]
-    text = [
-        "# Errors and what to do",
-        "Each is one sentence: what was given, what would be right, the nearest name.",
-    ]
-    text += [rows(("error", "meaning", "what to do"), body), "## One robot of a batch"]
-    text += [
-        "A robot that fails does not stop the others: `state.ok` is false, and `state.problems` says why."
-    ]
-    write("errors.md", "\n\n".join([*text, rows(("problem", "meaning"), problems)]))
+    tables = {
+        "kinds": rows(("error", "meaning", "what to do"), body),
+        "problems": rows(("problem", "meaning"), problems),
+    }
+    fill("errors", "errors.md", **tables)
 
 
 def _after_members(kind: type) -> list[str]:
