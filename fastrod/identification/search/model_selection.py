@@ -28,6 +28,7 @@ FRACTION_GAIN = 0.2
 Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 # standard errors from a law that another one contains: nearer it is that law, further the richer one
 NEAR_SUB_LAW, FAR_FROM_SUB_LAW = 2.0, 3.0
+AT_NOISE = 1.1**2  # of a loss: what "explained" is, too
 _MUCH = 300.0  # BIC by which a richer law is better, whatever its numbers: the contained one does not fit
 
 
@@ -171,10 +172,14 @@ def from_sub_law(state: ModelState, name: str, where: Mapping[str, str | float])
     return furthest
 
 
-def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candidate]) -> list[Candidate]:
+def by_estimate(
+    best: Candidate, rivals: list[Candidate], tried: Sequence[Candidate], noise: float
+) -> list[Candidate]:
     """The best and its rivals, once laws that contain one another are told apart: near the law that it
     contains the richer one is not listed, far from it the contained one is not, and between they are
-    rivals if the evidence cannot tell them apart."""
+    rivals if the evidence cannot tell them apart. Where more is left than a held-out loss `noise` explains,
+    the richer law's numbers stand for what is missing, too, and only the evidence counts against the other.
+    """
     for rich in [best, *rivals]:
         for name, where in trait(get_effect(rich.name), "nests").items():
             sub = next((c for c in tried if c.name == name and c.passes), None)
@@ -185,7 +190,7 @@ def by_estimate(best: Candidate, rivals: list[Candidate], tried: Sequence[Candid
             far = from_sub_law(rich.state, rich.name, where)
             if far <= NEAR_SUB_LAW and advantage(rich, sub) < _MUCH:
                 kept = sub
-            elif far >= FAR_FROM_SUB_LAW and rich.passes:
+            elif far >= FAR_FROM_SUB_LAW and rich.passes and rich.state.losses.sum() < AT_NOISE * noise:
                 kept = rich
             else:
                 continue  # for the evidence to say

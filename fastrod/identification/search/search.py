@@ -566,7 +566,7 @@ class Search:
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
-        return by_estimate(best, rivals, tried)
+        return by_estimate(best, rivals, tried, self._noise_loss(best))
 
     def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
@@ -576,10 +576,15 @@ class Search:
         if z_between(best, other) < Z_RIVAL and other.fraction > MOST_OF * best.fraction:
             return True
         assert best.state is not None
-        sigma = best.state.linearised.target.sigma
-        noise = best.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
         before, least, more = (float(s.losses.sum()) for s in (state, best.state, other.state))
-        return equally_wrong(before, least, more, noise, best.n_parameters - other.n_parameters)
+        fewer = best.n_parameters - other.n_parameters
+        return equally_wrong(before, least, more, self._noise_loss(best), fewer)
+
+    def _noise_loss(self, of: Candidate) -> float:
+        """Return what noise alone leaves of a candidate's held-out loss."""
+        assert of.state is not None
+        sigma = of.state.linearised.target.sigma
+        return of.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
 
     def beside(self, state: ModelState, name: str, found: ModelState) -> ModelState:
         """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
