@@ -91,7 +91,7 @@ def add_command(commands: Any, name: str, function: Command, more: Mapping[str, 
         default = None if one.default is one.empty else one.default
         if default not in (None, "") and not isinstance(default, (bool, tuple)) and "default" not in meaning:
             meaning += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
-        form = _form(hint, default) | {"help": meaning}
+        form = _form(hint, default) | {"help": meaning.replace("%", "%%")}
         if positional:
             number = "*" if one.kind is one.VAR_POSITIONAL else "?" if one.default is not one.empty else None
             parser.add_argument(one.name, metavar=key or one.name.upper(), nargs=number, **form)

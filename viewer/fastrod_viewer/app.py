@@ -337,7 +337,7 @@ def view(
         raise InputError(f"{given} goes with --dynamics: without, nothing has inertia.")
     if dynamics and robot is not None:
         raise InputError("--robot goes with a run log, and --dynamics with a robot; give one of them.")
-    with Ending() as ending, App(host=host, port=port, server=server) as app:
+    with Ending(), App(host=host, port=port, server=server) as app:
         line = f"{_title(what)}: {app.address} (Ctrl+C ends it)"
         address = threading.Timer(_SOON, print, (line,), {"flush": True})
         address.start()  # a first world compiles for half a minute
@@ -359,5 +359,4 @@ def view(
                 f"Other machines can open this page, too, at {app.served.elsewhere} and whoever has this "
                 "address can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
-        if not ending.come:
-            app.wait()
+        app.wait()
