@@ -31,14 +31,11 @@ if TYPE_CHECKING:
 
 _SWITCHES = 1e-3  # s: the thread of the drives waits no longer for one that draws
 _EVENTS = "events.csv"
-_HELP = "`fastrod drive --help` says how it is used."
 _EXIT = """exit code:
   0  done
   1  the robot does not answer, was stopped during the run, or what it measured does not suffice;
      what was recorded until then is kept
   2  the arguments or a file are wrong, and nothing has moved"""
-
-
 _Pose = tuple[float, float, float, float, float, float, float]
 """x, y, z, and a quaternion w, x, y, z."""
 
@@ -50,9 +47,9 @@ class _Eye:
     --emulate: the emulator in place of drives and camera
     --hardware FILE: drives, limits, camera and marker (default: the paper's prototype)
     --robot R: its model in place of the hardware file's; an identified.toml, say
-    --camera DEVICE: number or path of the video device; for teleop also none (default: 0)
+    --camera DEVICE: number or path of the video device (default: 0); none, for teleop alone
     --seed S: of what the emulator hides (default: nobody knows it)
-    --real-time: as slow as a robot, where nobody watches either; teleop always is
+    --real-time: the emulator as slow as a robot, where nobody watches either; teleop always is
     """
 
     emulate: bool = False
@@ -66,7 +63,7 @@ class _Eye:
         for name, emulated in (("camera", False), ("seed", True), ("real_time", True)):
             if getattr(self, name) not in (None, False) and self.emulate != emulated:
                 where = "with --emulate only" if emulated else "for a real bench, not with --emulate"
-                raise UsageError(f"--{name.replace('_', '-')} is {where}; {_HELP}")
+                raise UsageError(f"--{name.replace('_', '-')} is {where}.")
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,10 @@ class _Drives(_Eye):
 
     def __post_init__(self) -> None:
         if self.emulate == (self.bus is not None):
-            raise UsageError(f"give --bus INTERFACE:CHANNEL or --emulate, and not both; {_HELP}")
+            raise UsageError(
+                "give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how "
+                "it is used."
+            )
         if self.bus is not None and ":" not in self.bus:
             raise UsageError(f"--bus is {self.bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
         super().__post_init__()
@@ -168,9 +168,8 @@ def teleop(drives: _Drives, *, port: int | None = None, no_open: bool = False) -
     sys.setswitchinterval(_SWITCHES)
     try:
         with Ending() as ending:  # homing, too, ends with the drives switched off
-            FreeWorld(
-                hardware.robot
-            ).jacobian()  # compiled or loaded now: nothing may hold up the drives later
+            # compiled or loaded now: nothing may hold up the drives later
+            FreeWorld(hardware.robot).jacobian()
             wound = ", winding the tendons, looking for the marker: about 25 s"
             say(f"Finding the drives{'' if drives.no_home else wound} ...")
             with _bench(drives, hardware, stepped=False, journal=journal) as bench:
