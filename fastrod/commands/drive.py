@@ -110,12 +110,12 @@ class _Boarded(_Eye):
     out: Path | None = None
 
 
-def _action(*modules: str) -> Callable[[Command], Command]:
+def _action(command: str, *modules: str) -> Callable[[Command], Command]:
     """Decorate an action of a bench: errors of a run that failed are the exit code 1: a robot that does not
     answer or is stopped, a plan that it refused, measurements that do not suffice."""
 
     def decorate(function: Command) -> Command:
-        @needing("drive", "device", *modules)
+        @needing(command, "device", *modules)
         @functools.wraps(function)
         def run(*words: Any, **options: Any) -> int:
             from fastrod_device.errors import CalibrationError, DeviceError, RefusedError
@@ -133,7 +133,7 @@ def _action(*modules: str) -> Callable[[Command], Command]:
     return decorate
 
 
-_of_drives = _action("can", "canopen", "cv2")
+_of_drives = _action("drive", "can", "canopen", "cv2")
 
 
 @_of_drives
@@ -294,7 +294,7 @@ def loop(drives: _Drives, *, out: Path | None = None, payload: float | None = No
     return DONE
 
 
-@_action("cv2")
+@_action("camera", "cv2")
 def calibrate(eye: _Boarded) -> int:
     """The lens, from pictures of a charuco board that is waved; no drives needed."""
     from rich.console import Console
@@ -317,7 +317,7 @@ def calibrate(eye: _Boarded) -> int:
     return DONE
 
 
-@_action("cv2")
+@_action("camera", "cv2")
 def register(eye: _Boarded, *, at: Sequence[_Pose] = ()) -> int:
     """The camera's place, from pictures of a board at known places; no drives needed.
 

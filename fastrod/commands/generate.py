@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json as jsons
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ class DataSet:
         with progress() as bar:
             summary = generate(plan, self.out, workers=self.workers, ray=self.ray, progress=bar)
         if self.json:
-            print(jsons.dumps({**asdict(summary), "rate": summary.rate}, indent=1))
+            print(json.dumps({**asdict(summary), "rate": summary.rate}, indent=1))
         else:
             Console().print(_table(summary))
         return DONE
