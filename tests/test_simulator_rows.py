@@ -137,6 +137,7 @@ def same(one: State, other: State, rows: Any = slice(None)) -> bool:
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
+@pytest.mark.study(beyond=3)
 @pytest.mark.parametrize("case", CASES)
 def test_robots_put_back_begin_anew_and_the_others_notice_nothing(case: str) -> None:
     (sim, _, step), (alone, _, _), (fresh, _, _) = made(case), made(case), made(case)

@@ -7,7 +7,7 @@ import io
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from json import dumps, loads
 from pathlib import Path
@@ -581,6 +581,7 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+@cache
 def build() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = _Front(prog="fastrod")

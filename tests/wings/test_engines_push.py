@@ -79,7 +79,7 @@ def test_light_and_heavy_cubes_are_not_launched(stage, mass):
     assert_allclose(momentum, -impulse[-1], atol=1e-9)
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
     place = [BEYOND, 0.03, 0.02]
     speeds, momentum, impulse, ok = push(stage, 0.005, "axial", gravity=0.0, duration=0.4, place=place)
