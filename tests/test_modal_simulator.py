@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +10,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 from test_effects import NAMES, at_neutral, at_typical, having
-from test_simulator_rows import FIELDS, OTHERS, ROWS, N, stiffer
+from test_simulator_rows import FIELDS, MOTION, ROWS, N, carried, stiffer
 
-from fastrod import Lump, Modal, Modes, Robot, Simulator, State, load_robot
+from fastrod import Lump, Modal, Modes, Robot, Simulator, State
 from fastrod.errors import InputError, RobotError
 
 MOVING = {"dynamics": True, "dt": 2e-3}
 STILL = {"solver": "modal"}
 BOTH = pytest.mark.parametrize("options", [MOVING, STILL], ids=["in motion", "at rest"])
-ALL = f"{FIELDS} velocity strain kinetic_energy strain_energy".split()
+ALL, inputs = f"{FIELDS} {MOTION}".split(), carried()
 SPREAD = {
     "stiffness_taper",
     "precurvature",
@@ -39,22 +35,12 @@ def simulator(
     return Simulator(robot, n_robots, threads=1, **{"points_per_segment": 5} | options | more)
 
 
-def inputs(robot: Robot, k: int) -> dict[str, Any]:
-    """Inputs of step k: bends, forces and bases of N robots, each its own."""
-    t, i = 0.002 * k, np.arange(N)
-    angles = 0.5 * np.sin(np.outer((20.0, 33.0), np.full(N, t)) + i)
-    lengths = [bend(robot, *a) for a in angles.T]
-    force = 0.05 * np.sin(40.0 * t + i[:, None] + np.arange(3))
-    base = np.column_stack([0.002 * np.sin(50.0 * t + i), 0.0 * i, 0.1 * i, 1.0 + 0.0 * i, *np.zeros((3, N))])
-    return {"tendon_length": lengths, "tip_force": force, "base_pose": base}
-
-
 def begun(options: dict[str, Any], robot: Robot, n: int = 4) -> Simulator:
     """At rest, then n steps."""
     sim = simulator(robot, options)
-    assert sim.settle(**inputs(robot, 0)).ok.all()
+    assert sim.settle(**inputs(0)).ok.all()
     for k in range(1, n):
-        assert sim.step(**inputs(robot, k)).ok.all()
+        assert sim.step(**inputs(k)).ok.all()
     return sim
 
 
@@ -65,75 +51,12 @@ def assert_same(one: State, two: State, rows: Any = slice(None), rows_two: Any =
 
 
 @BOTH
-def test_a_snapshot_restores_every_bit(options: dict[str, Any]) -> None:
-    robot = having(heavy(), {"name": "backlash", "half_width": 2e-4})
-    sim = begun(options, robot)
-    kept, runs = sim.snapshot(), []
-    for _ in range(2):
-        runs.append([sim.step(**inputs(robot, k)) for k in range(4, 10)])
-        sim.restore(kept)
-    for one, two in zip(*runs, strict=True):
-        assert_same(one, two)
-
-
-@BOTH
-def test_restored_rows_go_on_as_they_did_and_the_others_do_not_notice(options: dict[str, Any]) -> None:
-    robot = having(heavy(), {"name": "backlash", "half_width": 2e-4})
-    sim, alone = begun(options, robot), begun(options, robot)
-    kept = sim.snapshot()
-    first = [sim.step(**inputs(robot, k)) for k in range(4, 8)]
-    for k in range(4, 8):
-        alone.step(**inputs(robot, k))
-    sim.restore(kept, ROWS)
-    for k in range(4, 8):
-        now, later = inputs(robot, k), inputs(robot, k + 4)
-        mixed = {name: np.where(np.isin(np.arange(N), ROWS)[:, None], now[name], later[name]) for name in now}
-        state = sim.step(**mixed)
-        assert_same(state, first[k - 4], ROWS)
-        assert_same(state, alone.step(**later), OTHERS)
-
-
-@BOTH
-def test_some_robots_settle_and_the_others_stay(options: dict[str, Any]) -> None:
-    robot = heavy()
-    sim, alone = begun(options, robot), begun(options, robot)
-    before, there = sim.state, inputs(robot, 20)
-    there["tendon_length"][0] = np.full(4, np.nan)  # of robot 0, which is left out: not read
-    state = sim.settle(**there, rows=ROWS)
-    assert_same(state, before, OTHERS)
-    fresh = simulator(robot, options).settle(**inputs(robot, 20))
-    assert_allclose(state.tip_position[ROWS], fresh.tip_position[ROWS], rtol=0, atol=1e-9)
-    assert_allclose(state.velocity[ROWS], 0.0, atol=1e-12)  # type: ignore[index]
-    for k in range(4, 8):
-        assert_same(sim.step(**inputs(robot, k)), alone.step(**inputs(robot, k)), OTHERS)
-
-
-@BOTH
-def test_replaced_robots_are_those_of_a_simulator_built_from_them(options: dict[str, Any]) -> None:
-    robot = heavy()
-    others = [stiffer(robot, 0.6), stiffer(robot, 1.7)]
-    listed = [robot, others[0], robot, others[1], robot]
-    sim, alone = begun(options, robot), begun(options, robot)
-    built = simulator(listed, options)
-    sim.replace(ROWS, others)
-    there = inputs(robot, 4)
-    built.settle(**there)
-    sim.settle(**there, rows=ROWS)
-    assert_same(sim.state, built.state, ROWS)
-    assert_same(sim.state, alone.state, OTHERS)
-    for k in range(4, 8):
-        state = sim.step(**inputs(robot, k))
-        assert_same(state, built.step(**inputs(robot, k)), ROWS)
-        assert_same(state, alone.step(**inputs(robot, k)), OTHERS)
-
-
-@BOTH
 def test_a_batch_of_different_robots_is_as_many_single_ones(options: dict[str, Any]) -> None:
     robots = [stiffer(heavy(line_density=0.05 + 0.02 * i), 1.0 + i) for i in range(N)]
     together = simulator(robots, options)
     single = [simulator(robot, options, 1) for robot in robots]
     for k in range(6):
-        given = inputs(robots[0], k)
+        given = inputs(k)
         state = (together.settle if k == 0 else together.step)(**given)
         assert state.ok.all()
         for i, sim in enumerate(single):
@@ -147,7 +70,7 @@ def test_many_lanes_answer_as_few_do(options: dict[str, Any]) -> None:
     few, many = simulator(robot, options), simulator(robot, options, 3 * N)
     assert few._rods.modal._kernels is not many._rods.modal._kernels  # type: ignore[attr-defined]
     for k in range(6):
-        given = inputs(robot, k)
+        given = inputs(k)
         thrice = {name: np.concatenate([a] * 3) for name, a in given.items()}
         one, three = (
             (sim.settle if k == 0 else sim.step)(**each) for sim, each in ((few, given), (many, thrice))
@@ -161,40 +84,12 @@ def test_a_batch_of_different_lumps_is_as_many_single_ones_to_rounding() -> None
     robots = [heavy(lumps=(Lump(at=0.01 + 0.01 * i, mass=1e-3 * i),)) for i in range(N)]
     together, single = simulator(robots, MOVING), [simulator(robot, MOVING, 1) for robot in robots]
     for k in range(6):
-        given = inputs(robots[0], k)
+        given = inputs(k)
         state = (together.settle if k == 0 else together.step)(**given)
         for i, sim in enumerate(single):
             alone = (sim.settle if k == 0 else sim.step)(**{name: a[i] for name, a in given.items()})
             assert_allclose(state.position[i], alone.position[0], rtol=0, atol=1e-14)
             assert_allclose(state.velocity[i], alone.velocity[0], rtol=0, atol=1e-11)
-
-
-THREADS = """
-import sys
-import numpy as np
-from dataclasses import replace
-from fastrod import Simulator, load_robot
-robot = load_robot("prototype")
-robot = replace(robot, segments=tuple(replace(s, line_density=0.1) for s in robot.segments))
-lengths = np.load(sys.argv[1])
-for name, threads in (("one", 1), ("two", 2)):
-    sim = Simulator(robot, 200, 1e-3, dynamics=True, points_per_segment=6, threads=threads)
-    settled, stepped = sim.settle(lengths).position, sim.step(1.001 * lengths).velocity
-    np.savez(sys.argv[2] + name, settled=settled, stepped=stepped)
-"""
-
-
-@pytest.mark.study
-def test_threads_change_no_bit(tmp_path: Path) -> None:
-    """In a process of its own, which has two threads wherever this one has one."""
-    angle, robot = np.random.default_rng(3).uniform(-1.0, 1.0, (200, 2)), load_robot("prototype")
-    np.save(tmp_path / "lengths.npy", [bend(robot, *a) for a in angle])
-    words = [sys.executable, "-c", THREADS, str(tmp_path / "lengths.npy"), f"{tmp_path}/"]
-    subprocess.run(words, check=True, env={**os.environ, "NUMBA_NUM_THREADS": "2"})
-    one, two = (np.load(tmp_path / f"{name}.npz") for name in ("one", "two"))
-    assert np.abs(one["stepped"]).max() > 0.0
-    for key in ("settled", "stepped"):
-        assert_array_equal(one[key], two[key])
 
 
 def test_a_robot_that_is_hard_to_solve_leaves_its_neighbours_alone() -> None:
@@ -203,7 +98,7 @@ def test_a_robot_that_is_hard_to_solve_leaves_its_neighbours_alone() -> None:
     sim, clean = begun(MOVING, robot), begun(MOVING, robot)
     rest = np.setdiff1d(np.arange(N), [1])
     for k in range(4, 8):
-        given = inputs(robot, k)
+        given = inputs(k)
         hard = given | {"tip_force": given["tip_force"].copy()}
         hard["tip_force"][1] = 20.0 * np.array([(-1.0) ** k, 0.3, -1.0])
         state, other = sim.step(**hard), clean.step(**given)
@@ -229,19 +124,19 @@ def test_lengths_with_noise_take_one_newton_step_as_smooth_ones_do() -> None:
 
 def test_one_bad_row_leaves_its_neighbours_alone() -> None:
     sim, clean = begun(MOVING, heavy()), begun(MOVING, heavy())
-    given = inputs(heavy(), 4)
+    given = inputs(4)
     given["tip_force"][1] = np.nan
     before = sim.state
     state = sim.step(**given)
     assert set(state.problems) == {1}
     assert "not finite" in state.problems[1]
     rest = np.setdiff1d(np.arange(N), [1])
-    assert_same(state, clean.step(**inputs(heavy(), 4)), rest)
+    assert_same(state, clean.step(**inputs(4)), rest)
     assert_array_equal(state.velocity[1], before.velocity[1])  # type: ignore[index]
     for k in range(5, 8):
-        state = sim.step(**inputs(heavy(), k))
+        state = sim.step(**inputs(k))
         assert state.ok.all()
-        assert_same(state, clean.step(**inputs(heavy(), k)), rest)
+        assert_same(state, clean.step(**inputs(k)), rest)
 
 
 @pytest.mark.study(beyond=14)
@@ -302,7 +197,7 @@ def test_shape_jacobian_and_compliance_are_those_of_the_observer(options: dict[s
     how: list[dict[str, Any]] = [{"solver": fine}, {}]
     modal, observer = (simulator(heavy(), more, points_per_segment=20) for more in how)
     for sim in (modal, observer):
-        sim.settle(**inputs(heavy(), 3))
+        sim.settle(**inputs(3))
     s = np.linspace(0.0, heavy().length, 9)
     assert_allclose(modal.shape(s).position, observer.shape(s).position, atol=1e-6)
     assert_allclose(modal.shape(s).rotation, observer.shape(s).rotation, atol=1e-4)
@@ -314,8 +209,8 @@ def test_shape_jacobian_and_compliance_are_those_of_the_observer(options: dict[s
 def test_only_the_tip_is_kept_where_no_more_is_asked_for() -> None:
     sim, full = simulator(heavy(), MOVING, outputs="tip"), simulator(heavy(), MOVING)
     for s in (sim, full):
-        s.settle(**inputs(heavy(), 0))
-        s.step(**inputs(heavy(), 1))
+        s.settle(**inputs(0))
+        s.step(**inputs(1))
     assert sim.state.velocity.shape == (0, 6, 3)  # type: ignore[union-attr]
     for name in ("tip_position", "kinetic_energy", "strain_energy", "residual", "ok"):
         assert_array_equal(getattr(sim.state, name), getattr(full.state, name))

@@ -20,6 +20,7 @@ from fastrod.model.segment_actions import SegmentActions
 
 N, ROWS, OTHERS = 5, np.array([1, 3]), np.array([0, 2, 4])
 FIELDS = "position rotation curvature tip_position tip_rotation tension base_wrench residual ok passes"
+MOTION = "velocity strain kinetic_energy strain_energy"
 Inputs = dict[str, Any]
 Step = Callable[[int], Inputs]
 
@@ -86,7 +87,8 @@ def test_a_gain_is_held_only_below_the_residual_that_is_allowed() -> None:
 
 
 def backlash() -> Robot:
-    return replace(rod(line_density=0.1), effects=({"name": "backlash", "half_width": 3e-4},))
+    heavy = rod(line_density=0.1, damping_time=1e-3)
+    return replace(heavy, effects=({"name": "backlash", "half_width": 3e-4},))
 
 
 def wiggled(robot: Robot, seed: int = 3) -> Step:
@@ -107,33 +109,50 @@ def walled() -> Step:
     return lambda k: {"tendon_length": bent(toward * np.sin(0.2 * k), 2.0 * np.cos(0.3 * k) * np.ones(N))}
 
 
+def carried() -> Step:
+    """Bends, tip forces and bases that move, each robot's its own."""
+    i = np.arange(N)
+
+    def at(k: int) -> Inputs:
+        t, angles = 0.002 * k, 0.5 * np.sin(np.outer((20.0, 33.0), np.full(N, 0.002 * k)) + i)
+        base = [0.002 * np.sin(50.0 * t + i), 0.0 * i, 0.1 * i, 1.0 + 0.0 * i, *np.zeros((3, N))]
+        force = 0.05 * np.sin(40.0 * t + i[:, None] + np.arange(3))
+        lengths = np.array([bend(rod(), *a) for a in angles.T])
+        return {"tendon_length": lengths, "tip_force": force, "base_pose": np.column_stack(base)}
+
+    return at
+
+
 WALL = ContactScene(
     obstacles=[plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall", friction=0.2)], rod_radius=0.0
 )
-CASES: dict[str, tuple[Robot, Step, ContactScene | None, float]] = {
-    "plain": (rod(), wiggled(rod()), None, 0.0),
-    "held": (rod(), wiggled(rod()), None, 1e-3),
-    "effect with memory": (backlash(), wiggled(rod()), None, 0.0),
-    "contact": (prototype(1e-5), walled(), WALL, 0.0),
+MODAL: dict[str, Inputs] = {"in motion": {"dynamics": True, "dt": 2e-3}, "at rest": {"solver": "modal"}}
+CASES: dict[str, tuple[Robot, Step, Inputs]] = {
+    "plain": (rod(), wiggled(rod()), {}),
+    "held": (rod(), wiggled(rod()), {"solver": Observer(kept_jacobian_tolerance=1e-3)}),
+    "effect with memory": (backlash(), wiggled(rod()), {}),
+    "contact": (prototype(1e-5), walled(), {"contact": WALL}),
+    **{name: (backlash(), carried(), {"points_per_segment": 5} | how) for name, how in MODAL.items()},
 }
 
 
 def simulator(robot: Robot | list[Robot], **options: Any) -> Simulator:
-    return Simulator(robot, N, dt=0.02, points_per_segment=8, threads=1, **options)
+    return Simulator(robot, N, **{"dt": 0.02, "points_per_segment": 8, "threads": 1} | options)
 
 
 def made(case: str) -> tuple[Simulator, Inputs, Step]:
     """A simulator at home, its inputs there, and what it is commanded after."""
-    robot, step, contact, hold = CASES[case]
-    home = {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim = simulator(robot, contact=contact, solver=Observer(kept_jacobian_tolerance=hold))
-    sim.settle(**home)
+    robot, step, options = CASES[case]
+    home = step(0) if case in MODAL else {"tendon_length": bend(robot, 0.1, -0.05)}
+    sim = simulator(robot, **options)
+    assert sim.settle(**home).ok.all()
     return sim, home, step
 
 
 def same(one: State, other: State, rows: Any = slice(None)) -> bool:
     """Whether these robots agree to the last bit."""
-    pairs = ((getattr(one, name)[rows], getattr(other, name)[rows]) for name in FIELDS.split())
+    names = FIELDS if one.velocity is None else f"{FIELDS} {MOTION}"
+    pairs = ((getattr(one, name)[rows], getattr(other, name)[rows]) for name in names.split())
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
@@ -154,6 +173,18 @@ def test_robots_put_back_begin_anew_and_the_others_notice_nothing(case: str) -> 
         assert same(state, alone.step(**step(k)), OTHERS)
         assert same(state, fresh.step(**step(k)), ROWS)
         assert state.ok.all()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_snapshot_restores_every_bit(case: str) -> None:
+    sim, _, step = made(case)
+    for k in range(3):
+        sim.step(**step(k))
+    kept, runs = sim.snapshot(), []
+    for _ in range(2):
+        runs.append([sim.step(**step(k)) for k in range(3, 9)])
+        sim.restore(kept)
+    assert all(same(*pair) for pair in zip(*runs, strict=True))
 
 
 def test_contact_and_backlash_matter_in_these_cases() -> None:
@@ -227,7 +258,7 @@ def test_all_rows_put_back_are_the_whole_snapshot() -> None:
         assert same(sim.step(**step(k)), whole.step(**step(k)))
 
 
-@pytest.mark.parametrize("case", ["plain", "held", "effect with memory"])
+@pytest.mark.parametrize("case", [case for case in CASES if case != "contact"])
 def test_some_robots_settle_and_the_others_stay(case: str) -> None:
     (sim, _, step), (alone, _, _), (fresh, _, _) = made(case), made(case), made(case)
     for k in range(6):
@@ -239,7 +270,9 @@ def test_some_robots_settle_and_the_others_stay(case: str) -> None:
     assert same(sim.state, before, OTHERS)
     assert (sim.state.residual[ROWS] < 1e-9).all()
     assert sim.state.ok.all()
-    if case != "effect with memory":  # where a robot settles depends on where its tendons were
+    if sim.state.velocity is not None:
+        assert_allclose(sim.state.velocity[ROWS], 0.0, atol=1e-12)
+    if not CASES[case][0].effects:  # where a robot settles depends on where its tendons were
         expected = fresh.settle(**step(20)).tip_position[ROWS]
         assert_allclose(sim.state.tip_position[ROWS], expected, rtol=0, atol=1e-8)
     for k in range(6, 14):
@@ -251,16 +284,15 @@ def stiffer(robot: Robot, factor: float) -> Robot:
     return replace(robot, segments=(replace(robot.segments[0], bending_stiffness=bending),))
 
 
-@pytest.mark.parametrize("robot", [rod(line_density=0.2), backlash()], ids=["plain", "effect with memory"])
-def test_replaced_robots_are_those_of_a_simulator_built_from_them(robot: Robot) -> None:
+@pytest.mark.parametrize("case", ["plain", "effect with memory", *MODAL])
+def test_replaced_robots_are_those_of_a_simulator_built_from_them(case: str) -> None:
+    robot, step, options = CASES[case]
     others = [stiffer(robot, 0.6), stiffer(robot, 1.7)]
     if robot.effects:
         others[1] = replace(others[1], effects=({"name": "backlash", "half_width": 1e-4},))
     listed = [robot, others[0], robot, others[1], robot]
-    step, home = wiggled(rod()), {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim, alone, built = simulator(robot), simulator(robot), simulator(listed)
-    for s in (sim, alone, built):
-        s.settle(**home)
+    (sim, home, _), (alone, _, _), built = made(case), made(case), simulator(listed, **options)
+    built.settle(**home)
     for k in range(6):
         sim.step(**step(k))
         alone.step(**step(k))
