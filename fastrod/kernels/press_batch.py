@@ -24,6 +24,8 @@ from .contact.press import PressedWorld, Touching, end_contacts, gather_world, p
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
 from .jit import entry
+from .rod.gather import pick, scatter
+from .vec import cross, scale
 
 
 @entry
@@ -118,6 +120,28 @@ def press_some(
             changed[i] = renewed
             for a in range(n_q):
                 step[i, a] = pressing.step[o * n_q + a]
+
+
+@entry
+def point_forces(
+    arclength: Floats, given: Floats, contacts: ContactSet, at: Floats, force: Floats, moment: Floats
+) -> None:
+    """Point forces of every robot, at `at` (n_robots, n_points) [m], and their moments (n_robots, n_points,
+    3): those that are `given` (1 or n_robots, n_given, 3), then its contacts, whose friction acts on the
+    surface, as far as there is room."""
+    n_given = arclength.shape[1]
+    for i in range(len(at)):
+        own = pick(i, len(arclength))
+        for q in range(n_given):
+            at[i, q] = arclength[own, q]
+            scatter(force[i, q], (given[own, q, 0], given[own, q, 1], given[own, q, 2]))
+        for c in range(min(contacts.used[i], at.shape[1] - n_given)):
+            contact, q = contacts.contact[i, c], n_given + c
+            f, n = contact["force"], contact["normal"]
+            at[i, q] = contact["arclength"]
+            scatter(force[i, q], (f[0], f[1], f[2]))
+            arm = scale(contact["radius"], (f[0], f[1], f[2]))
+            scatter(moment[i, q], cross(arm, (n[0], n[1], n[2])))
 
 
 @entry

@@ -15,7 +15,7 @@ import numpy as np
 from fastrod.kernels.rod.modal.chunk import ModalRun
 from fastrod.kernels.rod.modal.derivatives import ModalDerivatives
 from fastrod.kernels.rod.modal.fields import ModalWork
-from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints
+from fastrod.kernels.rod.modal.gather import ModalBatch, ModalPieces, ModalPoints, place_points
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.modes import (
     N_INTERVALS,
@@ -26,6 +26,7 @@ from fastrod.kernels.rod.modal.modes import (
     interval_of,
     legendre_at,
     modal_basis,
+    row_tables,
     rows_at,
 )
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, NODE_VECTORS, REST, ModalMotion
@@ -55,12 +56,15 @@ def _pool(n_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n_threads)
 
 
-def in_threads(tasks: int, run: Callable[[int], None]) -> None:
-    """Call `run` for each task, side by side where there are several."""
-    if tasks == 1:
-        run(0)
+def in_threads(count: int, each: int, run: Callable[[int, int, int], None]) -> None:
+    """Call `run` (task, first, last) for every `each` of so many things, side by side where there are
+    several."""
+    first = range(0, count, max(each, 1))
+    last = [min(k + each, count) for k in first]
+    if len(first) < 2:
+        run(0, 0, count)
     else:
-        list(_pool(tasks).map(run, range(tasks)))
+        list(_pool(len(first)).map(run, range(len(first)), first, last))
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
@@ -232,7 +236,7 @@ class ModalSolver:
         """Bodies that give way to the rods in the next step."""
         self._nearly = _NEARLY / math.sqrt(n_pieces)  # at the tip the errors of pieces add up
         self._narrow = n_robots <= _FEW or n_q > _LARGE
-        self._work: tuple[tuple[int, int], ModalWork] | None = None
+        self._work: dict[tuple[int, int], ModalWork] = {}  # by how many tasks, and stations
 
     @property
     def _kernels(self) -> Any:
@@ -334,6 +338,8 @@ class ModalSolver:
             )
 
         self._distribute(rows, run_some)
+        if not ends:
+            return
         # of what fades away each pass leaves less, in the end numbers below the normal ones: with these a
         # pass takes four times as long
         for array in self.motion[:3]:
@@ -459,18 +465,20 @@ class ModalSolver:
         lanes = self._kernels.LANES
         chunks = -(-len(rows) // lanes)
         tasks = 1 if chunks <= _SMALL else min(self.threads, chunks)
-        each, room = lanes * -(-chunks // tasks), self._workspace(tasks)
-        in_threads(
-            tasks, lambda k: run(rows[k * each : (k + 1) * each], ModalWork(*(a[k : k + 1] for a in room)))
-        )
+        room = self._workspace(tasks)
+
+        def run_some(task: int, first: int, last: int) -> None:
+            run(rows[first:last], ModalWork(*(a[task : task + 1] for a in room)) if tasks > 1 else room)
+
+        in_threads(len(rows), lanes * -(-chunks // tasks), run_some)
 
     def _workspace(self, tasks: int) -> ModalWork:
         """Kept: to make one takes as long as a step of one robot."""
         n_pieces, n_tendons, n_lumps = self._sizes
         size = tasks, n_lumps + self.points.piece.shape[1]
-        if self._work is None or self._work[0] != size:
-            self._work = size, self._kernels.modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
-        return self._work[1]
+        if size not in self._work:
+            self._work[size] = self._kernels.modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
+        return self._work[size]
 
     def place_points(self, points: tuple[Floats, ...], extension: Floats) -> None:
         """Arclengths (1 or n_robots, n_points) [m] of point forces (1 or n_robots, n_points, 3) [N], and of
@@ -480,21 +488,16 @@ class ModalSolver:
         if not m:
             self.points = no_points(n)
             return
-        ends = np.cumsum(self.params.length + extension, axis=1)
-        ends = np.broadcast_to(ends, (n, ends.shape[1]))
-        s = np.broadcast_to(arclength, (n, m))
-        segment = (s[:, :, None] > ends[:, None, :-1]).sum(2)
-        starts = np.concatenate([np.zeros((n, 1)), ends], axis=1)
-        first, last = (np.take_along_axis(starts, segment + k, 1) for k in range(2))
-        per = len(self.pieces.segment) // ends.shape[1]
-        x = np.clip((s - first) / (last - first), 0.0, 1.0) * per
-        inside = np.minimum(x.astype(np.int64), per - 1)
+        row, slope = np.empty((2, n, m, N_INTERVALS + 1))
         self.points = ModalPoints(
-            np.ascontiguousarray(segment * per + inside),
-            *rows_at(x - inside),
+            np.empty((n, m), np.int64),
+            row,
+            slope,
             np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
             points[2] if len(points) > 2 else np.zeros((n, m, 3)),
         )
+        ends = np.cumsum(self.params.length + extension, axis=1)
+        place_points(ends, np.ascontiguousarray(arclength), self.modes.pieces, row_tables(), self.points)
 
     def new_motion_shape(self, outputs: Literal["full", "tip"]) -> MotionShape:
         """Room for what a pass writes of the motion."""

@@ -23,7 +23,7 @@ from fastrod.kernels.contact.press import RENEWED
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
-from fastrod.kernels.press_batch import end_some, press_some, renew_some, violations
+from fastrod.kernels.press_batch import end_some, point_forces, press_some, renew_some, violations
 from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
 from fastrod.model.robot import Robot
 from fastrod.rotation import displaced
@@ -43,7 +43,8 @@ _PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
 _SWINGS = 12  # steps back in which the steps must have become half as long
 _BACK_AND_FORTH, _SHORTEST = 2, 0.2  # swings after which steps are shortened, and by how much at most
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
-_MOVING = 2  # passes in which contacts follow the places where the gap is least
+# passes in which contacts follow the places where the gap is least, in motion and to a rest
+_MOVING, _SEEKING = 2, 4
 # slips that a step uses are updated in so many passes, and in a rest after such a step [rad], to this [m]
 _RENEWING, _NEAR, _EXACTLY = 2, 1e-3, 5e-8
 _STILL = 1e-6  # rad: a Newton step below it is the last one
@@ -360,8 +361,9 @@ class TouchingRods(ModalRods):
         start, q = (np.concatenate([a, base], axis=1) for a in (motion.q, motion.q + how.dt * motion.rate))
         length = float(np.max(modal.params.rod_length))
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
-        then, moving = ContactSet(*(a.copy() for a in contacts)), _MOVING if follow else 0
-        most = _PASSES if self.dynamics else _TO_REST
+        then = ContactSet(*(a.copy() for a in contacts))
+        most, moving = (_PASSES, _MOVING) if self.dynamics else (_TO_REST, _SEEKING)
+        moving = moving if follow else 0
         # last step, the least one that halved in time, and what the last leaves to be done [rad]
         size, least, over = np.full((3, n), np.inf)
         swings, taken, relaxed = np.zeros(n, np.int64), np.zeros_like(q), np.ones(n)
@@ -422,7 +424,7 @@ class TouchingRods(ModalRods):
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
             known = (contacts.used == before[0]) & (contacts.contact["arclength"] == before[1]).all(1)
-            known &= self.dynamics and count > 0
+            known &= count > 0
             by = np.where(known[left], np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
             over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
@@ -465,24 +467,21 @@ class TouchingRods(ModalRods):
 
     def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: bool) -> None:
         """`renew_some` on so many threads."""
-        batches = np.array_split(np.arange(len(rows)), self.engine.thread_count(len(rows)))
 
-        def renew(task: int) -> None:
-            some = batches[task]
-            renew_some(rows[some], *(*seen, near[some], n_found[some], still))
+        def renew(_: int, first: int, last: int) -> None:
+            renew_some(rows[first:last], *(*seen, near[first:last], n_found[first:last], still))
 
-        in_threads(len(batches), renew)
+        in_threads(len(rows), -(-len(rows) // self.engine.thread_count(len(rows))), renew)
 
     def _press(self, rows: Ints, given: Any) -> None:
         """`press_some` on so many threads."""
         start, robot = self.engine.in_worlds(rows)[:2]
-        batches = np.array_split(np.arange(len(start) - 1), self.engine.thread_count(len(start) - 1))
+        n = len(start) - 1
 
-        def press(task: int) -> None:
-            some = batches[task]
-            press_some(start[some[0] : some[-1] + 2], robot, *given)
+        def press(_: int, first: int, last: int) -> None:
+            press_some(start[first : last + 1], robot, *given)
 
-        in_threads(len(batches), press)
+        in_threads(n, -(-n // self.engine.thread_count(n)), press)
 
     def _seen(
         self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, frames: Any
@@ -509,22 +508,12 @@ class TouchingRods(ModalRods):
     def _points(self, rows: Ints, acting: Acting) -> tuple[Floats, Floats, Floats]:
         """Point forces: those that are given, then the contacts of these robots, whose friction acts on the
         surface; and their moments."""
-        contacts = self.engine.contact_set
-        arclength, force = acting.points
+        contacts, (arclength, given) = self.engine.contact_set, acting.points
         most = -(-int(contacts.used[rows].max(initial=0)) // _ROOM) * _ROOM
-        there = np.arange(most) < contacts.used[:, None]
-        every = contacts.contact[:, :most]
-        s = np.where(there, every["arclength"], 0.0)
-        f = np.where(there[:, :, None], every["force"], 0.0)
-        moment = np.where(
-            there[:, :, None], np.cross(every["force"], every["normal"]) * every["radius"][:, :, None], 0.0
-        )
-        given = arclength.shape[1]
-        if given:
-            s = np.concatenate([np.broadcast_to(arclength, (self.n_robots, given)), s], axis=1)
-            f = np.concatenate([np.broadcast_to(force, (self.n_robots, given, 3)), f], axis=1)
-            moment = np.concatenate([np.zeros((self.n_robots, given, 3)), moment], axis=1)
-        return s, f, moment
+        at = np.zeros((self.n_robots, arclength.shape[1] + most))
+        force, moment = np.zeros((2, *at.shape, 3))
+        point_forces(arclength, given, contacts, at, force, moment)
+        return at, force, moment
 
 
 def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from fastrod.types import Floats, Ints, Layout, Params, Ports
 
-from ...jit import inline, kernel
+from ...jit import entry, inline, kernel
 from ...vec import Vec, axpy, from_quaternion, scale, sub
 from ..gather import pick
 from ..lanes import Lanes, W, get, put, put_mat, write
@@ -79,6 +81,36 @@ class ModalPoints(NamedTuple):
     """(n_robots, n_points, 3) world [N]."""
     moment: Floats
     """(n_robots, n_points, 3) world [N m]."""
+
+
+@entry
+def place_points(
+    ends: Floats, arclength: Floats, per_segment: int, tables: tuple[Floats, Floats], points: ModalPoints
+) -> None:
+    """Piece and rows of point forces at `arclength` (1 or n_robots, n_points) of robots whose segments end at
+    `ends` (1 or n_robots, n_segments) [m]; `tables` as `row_tables`."""
+    lagrange, integral = tables
+    value = np.ones(len(integral))
+    for i in range(points.piece.shape[0]):
+        end, places = ends[pick(i, len(ends))], arclength[pick(i, len(arclength))]
+        for q in range(points.piece.shape[1]):
+            k = 0
+            while k < len(end) - 1 and places[q] > end[k]:
+                k += 1
+            first = end[k - 1] if k > 0 else 0.0
+            x = per_segment * min(max((places[q] - first) / (end[k] - first), 0.0), 1.0)
+            inside = min(int(x), per_segment - 1)
+            points.piece[i, q] = k * per_segment + inside
+            value[1] = z = 2.0 * (x - inside) - 1.0
+            for d in range(2, len(value)):
+                value[d] = (value[d - 1] * z * (2 * d - 1) - value[d - 2] * (d - 1)) / d
+            for j in range(points.row.shape[2]):
+                row, slope = 0.0, 0.0
+                for d in range(len(integral)):
+                    row += value[d] * integral[d, j]
+                for d in range(len(lagrange)):
+                    slope += value[d] * lagrange[d, j]
+                points.row[i, q, j], points.slope[i, q, j] = row, slope
 
 
 class ModalBatch(NamedTuple):

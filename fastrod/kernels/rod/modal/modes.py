@@ -70,9 +70,15 @@ def integral_row(x: Floats | float, n: int = N_INTERVALS) -> Floats:
     return _times(legendre_at(x, n + 2), _points(n)[2])
 
 
+def row_tables(n: int = N_INTERVALS) -> tuple[Floats, Floats]:
+    """Legendre coefficients (n_degrees, N + 1) of the Lagrange polynomials of the nodes, and of the integrals
+    from 0 of these."""
+    return _points(n)[1:]
+
+
 def rows_at(x: Floats | float, n: int = N_INTERVALS) -> tuple[Floats, Floats]:
     """That row, and (..., N + 1) Lagrange polynomials of the nodes at x."""
-    values, (_, lagrange, integral) = legendre_at(x, n + 2), _points(n)
+    values, (lagrange, integral) = legendre_at(x, n + 2), row_tables(n)
     return _times(values, integral), _times(values[..., :-1], lagrange)
 
 
