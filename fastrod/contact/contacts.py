@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.errors import UnknownNameError, nearest
+from fastrod.rotation import cross
 from fastrod.types import Clearance, ContactSet, Flags, Floats, Ints, RodShape
 
 CLOSED = 1e-9
@@ -104,9 +105,9 @@ def contacts_of(
     for k in range(n_obstacles):
         on = np.where((index == k)[:, :, None], -force, 0.0)
         wrench[:, k, :3] = on.sum(1)
-        wrench[:, k, 3:] = np.cross(
-            np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on
-        ).sum(1)
+        wrench[:, k, 3:] = cross(np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on).sum(
+            1
+        )
     return Contacts(
         names=names,
         count=count,

@@ -75,7 +75,11 @@ class RodBodies:
     def place(self, position: Floats, rotation: Floats) -> None:
         """Stand at rest along the nodes: `position` (n_capsules + 1, 3) world [m], `rotation` (n_capsules +
         1, 3, 3)."""
-        self._position, self._quaternion = chords(position, rotation)
+        self.stand(*chords(position, rotation))
+
+    def stand(self, center: Floats, quaternion: Floats) -> None:
+        """Stand at rest with the middles there, (n_capsules, 3) world [m], rotated so, (n_capsules, 4)."""
+        self._position, self._quaternion = center, quaternion
         for own, p, q in zip(
             self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True
         ):
@@ -86,10 +90,14 @@ class RodBodies:
         """Move toward these nodes so that the next step of `dt` [s] ends there: what they meet feels the
         velocity. `place` them afterwards, or they keep moving."""
         to, orientation = chords(position, rotation)
-        linear = (to - self._position) / dt
-        angular = rotation_between(self._quaternion, orientation) / dt
-        for own, v, w in zip(self.ids, linear.tolist(), angular.tolist(), strict=True):
-            self.bullet.resetBaseVelocity(own, v, w)
+        angular = rotation_between(self._quaternion, orientation)
+        self.move(np.concatenate([to - self._position, angular], axis=1) / dt)
+
+    def move(self, velocity: Floats) -> None:
+        """Move at these velocities from now on, (n_capsules, 6) of the middles [m/s] and angular [rad/s],
+        world."""
+        for own, v in zip(self.ids, velocity.tolist(), strict=True):
+            self.bullet.resetBaseVelocity(own, v[:3], v[3:])
 
     def remove(self) -> None:
         """Take the capsules out of the world."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.contact import Obstacle
 from fastrod.hosts.host import Motion
-from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.solver.state import State
 from fastrod.types import Floats
 
@@ -94,10 +94,10 @@ class BodyContact(ABC):
         step."""
 
     @final
-    def mobility(self) -> tuple[float, Floats, Floats]:
+    def mobility(self, pose: Floats | None = None) -> tuple[float, Floats, Floats]:
         """Return its mobility in the next step: displacement per force [m/N] and rotation per moment (3, 3)
-        [rad/(N m)], and its centre of mass (3,)."""
-        pose = self.com().pose
+        [rad/(N m)], and its centre of mass (3,); at the `pose` (7,) of that, or where it is now."""
+        pose = self.com().pose if pose is None else pose
         if self.mass == 0.0:
             return 0.0, np.zeros((3, 3)), pose[:3]
         rotation = matrix_from_quaternion(pose[None, 3:])[0]
@@ -116,7 +116,7 @@ class BodyContact(ABC):
         motion = self.com()
         if self.mass > 0.0:
             known = self._past - self.relaxation / self.dt * self._before
-            by_force, by_moment, _ = self.mobility()
+            by_force, by_moment, _ = self.mobility(motion.pose)
             change = np.concatenate([by_force * known[:3], by_moment @ known[3:]])
             per = 1.0 / (self._weight * self.dt + self.relaxation)
             motion = motion._replace(velocity=motion.velocity + per * change)
@@ -128,7 +128,7 @@ class BodyContact(ABC):
         for shape in self.shapes:
             arm = rotation @ shape.position
             poses[shape.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], shape.quaternion)])
-            linear = motion.velocity[:3] + np.cross(motion.velocity[3:], arm)
+            linear = motion.velocity[:3] + cross(motion.velocity[3:], arm)
             velocities[shape.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
         return poses, velocities
 
@@ -143,7 +143,7 @@ class BodyContact(ABC):
         if self.mass == 0.0:
             return np.zeros(6), com
         points, forces = _pushes(state, self.names)
-        wrench = np.concatenate([forces.sum(0), np.cross(points - com, forces).sum(0)])
+        wrench = np.concatenate([forces.sum(0), cross(points - com, forces).sum(0)])
         more = self.relaxation / self.dt * (wrench - self._before)
         more += self._past - (1.0 - self._weight) * wrench
         along = wrench[:3] if wrench[:3].any() else self._before[:3]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix, rotation_between
+from fastrod.rotation import cross, matrix_from_quaternion, quaternion_from_matrix, rotation_between
 from fastrod.types import Floats
 
 
@@ -45,7 +45,7 @@ def chords(position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
     x = 0.5 * (rotation[..., :-1, :, 0] + rotation[..., 1:, :, 0])
     x = x - (x * z).sum(-1, keepdims=True) * z
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    frames = np.stack([x, np.cross(z, x), z], axis=-1)
+    frames = np.stack([x, cross(z, x), z], axis=-1)
     return 0.5 * (position[..., :-1, :] + position[..., 1:, :]), quaternion_from_matrix(frames)
 
 

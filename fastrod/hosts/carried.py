@@ -17,6 +17,7 @@ from fastrod.hosts.body_contact import BodyContact
 from fastrod.hosts.host import Host
 from fastrod.hosts.rod import INPUTS, Rod
 from fastrod.model.robot import Robot
+from fastrod.rotation import cross
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
@@ -132,7 +133,7 @@ class CarriedRod(ABC):
             for contact in self.body_contacts:
                 more, point = contact.push(state)
                 self.wrench[:3] -= more[:3]
-                self.wrench[3:] -= more[3:] + np.cross(point - motion.pose[:3], more[:3])
+                self.wrench[3:] -= more[3:] + cross(point - motion.pose[:3], more[:3])
         else:
             self.wrench = 0.5 * self.wrench
             for contact in self.body_contacts:

@@ -10,18 +10,18 @@ from numpy.typing import ArrayLike
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.host import Freedom, Motion
-from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.types import Floats
 
 
 def from_xyzw(quaternion: ArrayLike) -> Floats:
     """(..., 4) quaternion w x y z of PyBullet's x y z w (..., 4)."""
-    return np.roll(np.asarray(quaternion, float), 1, axis=-1)
+    return np.asarray(quaternion, float).take((3, 0, 1, 2), -1)
 
 
 def to_xyzw(quaternion: ArrayLike) -> Floats:
     """(..., 4) PyBullet's x y z w of a quaternion w x y z (..., 4)."""
-    return np.roll(np.asarray(quaternion, float), -1, axis=-1)
+    return np.asarray(quaternion, float).take((1, 2, 3, 0), -1)
 
 
 @final
@@ -53,7 +53,7 @@ class BulletLink:
         """Motion of the rod's base."""
         pose, velocity = link_motion(self.bullet, self.body, self.link)
         arm = matrix_from_quaternion(pose[None, 3:])[0] @ self._position
-        velocity[:3] += np.cross(velocity[3:], arm)
+        velocity[:3] += cross(velocity[3:], arm)
         return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
 
     def freedom(self, dt: float) -> Freedom:
@@ -109,7 +109,7 @@ def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
     # com_from_frame, for bodies whose mass is off their origin
     back = bullet.invertTransform(inertial[3], inertial[4])
     position, quaternion = bullet.multiplyTransforms(pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), *back)
-    velocity[:3] += np.cross(velocity[3:], np.subtract(position, pose[:3]))
+    velocity[:3] += cross(velocity[3:], np.subtract(position, pose[:3]))
     return Motion(np.array([*position, *from_xyzw(quaternion)]), velocity)
 
 

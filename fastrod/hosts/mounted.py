@@ -146,7 +146,6 @@ class MountedRod(CarriedRod):
             capsules_per_segment=capsules_per_segment,
             dynamics=dynamics,
         )
-        self._nodes_per_capsule = points_per_segment // capsules_per_segment
         radii = self.rod.radius.tolist()
         lengths = (
             np.repeat([segment.length for segment in robot.segments], capsules_per_segment)
@@ -177,20 +176,16 @@ class MountedRod(CarriedRod):
         return self.bodies.ids
 
     def _place(self) -> None:
-        self.bodies.place(*self._nodes())
+        self.bodies.stand(*self.rod.capsules[:2])
 
     def _head_for(self) -> None:
-        self.bodies.head_for(*self._nodes(), self.dt)
+        self.bodies.move(self.rod.capsules.velocity)
 
     def _step_engine(self) -> None:
         self.bullet.stepSimulation()
 
     def _release(self) -> None:
         """PyBullet forgets its external forces by itself."""
-
-    def _nodes(self) -> tuple[Floats, Floats]:
-        state = self.rod.state
-        return state.position[0, :: self._nodes_per_capsule], state.rotation[0, :: self._nodes_per_capsule]
 
 
 def _link_of(body: object) -> tuple[int, int]:

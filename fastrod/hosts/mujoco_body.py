@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from fastrod.errors import HostError, nearest
 from fastrod.hosts.host import Freedom, Motion
 from fastrod.hosts.link import mount_pose
-from fastrod.rotation import product, quaternion_from_matrix
+from fastrod.rotation import cross, product, quaternion_from_matrix
 from fastrod.types import Floats
 
 
@@ -144,7 +144,7 @@ class MujocoBody:
         refresh(self.model, self.data)
         pose = self._base()
         velocity = velocity_of(self.model, self.data, self.body, com=False)
-        velocity[:3] += np.cross(velocity[3:], pose[:3] - self.data.xpos[self.body])
+        velocity[:3] += cross(velocity[3:], pose[:3] - self.data.xpos[self.body])
         return Motion(pose, velocity + self._given_velocity(pose[:3]))
 
     def _base(self) -> Floats:
@@ -155,7 +155,7 @@ class MujocoBody:
     def _given_velocity(self, point: Floats) -> Floats:
         """(6,) that a mocap body is given, at a point of it."""
         velocity = self.mocap_velocity.copy()
-        velocity[:3] += np.cross(velocity[3:], point - self.data.xpos[self.body])
+        velocity[:3] += cross(velocity[3:], point - self.data.xpos[self.body])
         return velocity
 
     def freedom(self, dt: float) -> Freedom:
@@ -177,7 +177,7 @@ class MujocoBody:
     def exert(self, wrench: Floats) -> None:
         """Force and moment about the base point, world, during the next mj_step, and until `release`."""
         arm = self.motion().pose[:3] - self.data.xipos[self.body]
-        self._applied.put(np.concatenate([wrench[:3], wrench[3:] + np.cross(arm, wrench[:3])]))
+        self._applied.put(np.concatenate([wrench[:3], wrench[3:] + cross(arm, wrench[:3])]))
 
     def release(self) -> None:
         """Feel no more of it."""

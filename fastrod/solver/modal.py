@@ -493,7 +493,7 @@ class ModalSolver:
             np.empty((n, m), np.int64),
             row,
             slope,
-            np.array(np.broadcast_to(force, (n, m, 3)), order="C"),
+            np.ascontiguousarray(force if len(force) == n else np.broadcast_to(force, (n, m, 3))),
             points[2] if len(points) > 2 else np.zeros((n, m, 3)),
         )
         ends = np.cumsum(self.params.length + extension, axis=1)

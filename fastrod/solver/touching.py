@@ -124,10 +124,11 @@ class TouchingRods(ModalRods):
             start, inputs = copied(self.modal.motion), (before, acting.ports)
             jump, pressed = stepper.jumps(*inputs), engine.pressed()
             free = warm[~pressed[warm]]
-            ok[free] = stepper.advance(free, inputs, jump, found)
-            self._passes[free] = np.abs(self.modal.iterations[free])
-            meets = pressed | engine.overlap(free[ok[free]], found.shape)
-            some = warm[meets[warm]]
+            if len(free):
+                ok[free] = stepper.advance(free, inputs, jump, found)
+                self._passes[free] = np.abs(self.modal.iterations[free])
+                pressed |= engine.overlap(free[ok[free]], found.shape)
+            some = warm[pressed[warm]]
             _put(self.modal.motion, start, some)
             ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
         self.modal.host = no_hosts()
@@ -194,6 +195,8 @@ class TouchingRods(ModalRods):
     ) -> Flags:
         """(n_robots,) who came to rest: freely, or else as `rest_pressed`."""
         engine, motion, ok = self.engine, self.modal.motion, np.zeros(self.n_robots, bool)
+        if not len(rows):
+            return ok
         engine.begin_anew(cold)
         start, pressed = copied(motion), engine.pressed()
         free = rows[~pressed[rows]]
