@@ -139,9 +139,7 @@ class CarriedRod(ABC):
             for contact in self.body_contacts:
                 contact.push_half()
         self._host.exert(self.wrench)
-        if begins:
-            self._place()
-        self._head_for()
+        (self._place if begins else self._head_for)()
         return state
 
     @final

@@ -38,7 +38,7 @@ from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
 _NOTHING = 1e-100
-_SMALL = 4  # chunks: for so many, to start threads costs more than it saves
+_SMALL = 640  # unknowns of all robots: for so few, to start threads costs more than it saves
 _FEW, _LARGE = 8, 64  # robots, and unknowns of one: for so few, or for more of them, lanes are few
 _NEARLY = 0.05  # rad of one piece: a Newton step of this size leaves an error of its square
 _MOST = 200
@@ -464,7 +464,7 @@ class ModalSolver:
         """Call `run` with some of the rows and a workspace for these, on so many threads."""
         lanes = self._kernels.LANES
         chunks = -(-len(rows) // lanes)
-        tasks = 1 if chunks <= _SMALL else min(self.threads, chunks)
+        tasks = 1 if len(rows) * self.motion.q.shape[1] <= _SMALL else min(self.threads, chunks)
         room = self._workspace(tasks)
 
         def run_some(task: int, first: int, last: int) -> None:
