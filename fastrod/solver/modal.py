@@ -38,7 +38,8 @@ from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 SCHEMES: dict[str, int] = dict(zip(get_args(SchemeName), (BDF1, BDF2, GENERALIZED_ALPHA), strict=True))
 _NOTHING = 1e-100
-_SMALL = 640  # unknowns of all robots: for so few, to start threads costs more than it saves
+# chunks, and unknowns squared of all robots: for so few, to start threads costs more than it saves
+_SMALL, _LIGHT = 4, 40_000
 _FEW, _LARGE = 8, 64  # robots, and unknowns of one: for so few, or for more of them, lanes are few
 _NEARLY = 0.05  # rad of one piece: a Newton step of this size leaves an error of its square
 _MOST = 200
@@ -464,7 +465,8 @@ class ModalSolver:
         """Call `run` with some of the rows and a workspace for these, on so many threads."""
         lanes = self._kernels.LANES
         chunks = -(-len(rows) // lanes)
-        tasks = 1 if len(rows) * self.motion.q.shape[1] <= _SMALL else min(self.threads, chunks)
+        light = chunks <= _SMALL and len(rows) * self.motion.q.shape[1] ** 2 <= _LIGHT
+        tasks = 1 if light else min(self.threads, chunks)
         room = self._workspace(tasks)
 
         def run_some(task: int, first: int, last: int) -> None:
@@ -477,7 +479,9 @@ class ModalSolver:
         n_pieces, n_tendons, n_lumps = self._sizes
         size = tasks, n_lumps + self.points.piece.shape[1]
         if size not in self._work:
-            self._work[size] = self._kernels.modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
+            made = self._kernels.modal_workspace(tasks, n_pieces, n_tendons, size[1], self.basis)
+            # numba takes the class of few lanes and that of many for one, and types each call anew
+            self._work[size] = ModalWork(*made)
         return self._work[size]
 
     def place_points(self, points: tuple[Floats, ...], extension: Floats) -> None:
