@@ -20,7 +20,8 @@ from fastrod.types import (
 from .contact.bvh import STACK
 from .contact.candidates import renew_contacts
 from .contact.contact_set import violation
-from .contact.press import PressedWorld, Touching, end_contacts, gather_world, press
+from .contact.press import end_contacts, press
+from .contact.pressed_world import PressedWorld, Touching, gather_world
 from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import MOST_PLANES
 from .jit import entry

@@ -7,7 +7,8 @@ import pytest
 from numba import njit
 from numpy.testing import assert_allclose
 
-from fastrod.kernels.contact.press import SOFT, PressedWorld, press
+from fastrod.kernels.contact.press import press
+from fastrod.kernels.contact.pressed_world import SOFT, PressedWorld
 from fastrod.types import CONTACT, ContactSet
 
 
