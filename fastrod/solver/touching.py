@@ -425,10 +425,11 @@ class TouchingRods(ModalRods):
             relaxed = np.where(swings >= _BACK_AND_FORTH, np.clip(aitken, _SHORTEST, 1.0), 1.0)
             q[left] += relaxed[left, None] * step[left]
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
-            # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay
+            # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay; of a
+            # rest by short ones, for long ones may go away and back
             known = (contacts.used == before[0]) & (contacts.contact["arclength"] == before[1]).all(1)
-            known &= count > 0
-            by = np.where(known[left], np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
+            short = last < (np.inf if self.dynamics else _NEAR)
+            by = np.where(known[left] & short, np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
             over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
             self._passes[left] += 1
