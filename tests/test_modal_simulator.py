@@ -80,6 +80,29 @@ def test_many_lanes_answer_as_few_do(options: dict[str, Any]) -> None:
             assert_allclose(b, np.concatenate([a] * 3), rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+def test_kernels_of_few_and_of_many_lanes_do_not_type_their_calls_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Numba looks a call up by the fields of its tuples, not by their class: of two classes with the same
+    fields it takes one for the other, and finds the kernel only after it has typed each array again."""
+    few, many = simulator(heavy(), MOVING), simulator(heavy(), MOVING, 3 * N)
+
+    def go(k: int) -> None:
+        for sim, n in ((few, 1), (many, 3)):
+            given = {name: np.concatenate([a] * n) for name, a in inputs(k).items()}
+            (sim.settle if k == 0 else sim.step)(**given)
+
+    def anew(*_: Any, **__: Any) -> None:
+        raise AssertionError("typed anew")
+
+    go(0)
+    go(1)
+    for sim in (few, many):
+        kernels = sim._rods.modal._kernels  # type: ignore[attr-defined]
+        monkeypatch.setattr(kernels.pass_modes, "_compile_for_args", anew, raising=False)
+    go(2)
+
+
 def test_a_batch_of_different_lumps_is_as_many_single_ones_to_rounding() -> None:
     robots = [heavy(lumps=(Lump(at=0.01 + 0.01 * i, mass=1e-3 * i),)) for i in range(N)]
     together, single = simulator(robots, MOVING), [simulator(robot, MOVING, 1) for robot in robots]
