@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -87,20 +88,21 @@ def test_kernels_of_few_and_of_many_lanes_do_not_type_their_calls_anew(
     fields it takes one for the other, and finds the kernel only after it has typed each array again."""
     few, many = simulator(heavy(), MOVING), simulator(heavy(), MOVING, 3 * N)
 
+    def kernel_of(sim: Simulator) -> Any:
+        return sim._rods.modal._kernels.pass_modes  # type: ignore[attr-defined]
+
     def go(k: int) -> None:
         for sim, n in ((few, 1), (many, 3)):
             given = {name: np.concatenate([a] * n) for name, a in inputs(k).items()}
             (sim.settle if k == 0 else sim.step)(**given)
 
-    def anew(*_: Any, **__: Any) -> None:
-        raise AssertionError("typed anew")
-
     go(0)
     go(1)
-    for sim in (few, many):
-        kernels = sim._rods.modal._kernels  # type: ignore[attr-defined]
-        monkeypatch.setattr(kernels.pass_modes, "_compile_for_args", anew, raising=False)
+    anew = [Mock(wraps=kernel._compile_for_args) for kernel in map(kernel_of, (few, many))]
+    for sim, typed in zip((few, many), anew, strict=True):
+        monkeypatch.setattr(kernel_of(sim), "_compile_for_args", typed)
     go(2)
+    assert [typed.call_count for typed in anew] == [0, 0]
 
 
 def test_a_batch_of_different_lumps_is_as_many_single_ones_to_rounding() -> None:

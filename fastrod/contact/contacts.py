@@ -105,9 +105,8 @@ def contacts_of(
     for k in range(n_obstacles):
         on = np.where((index == k)[:, :, None], -force, 0.0)
         wrench[:, k, :3] = on.sum(1)
-        wrench[:, k, 3:] = cross(np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on).sum(
-            1
-        )
+        arm = np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0)
+        wrench[:, k, 3:] = cross(arm, on).sum(1)
     return Contacts(
         names=names,
         count=count,
