@@ -158,6 +158,8 @@ class Surfaces(NamedTuple):
     sphere: Floats
     """(n_obstacles, 4) centre and radius of a ball that holds the obstacle; radius infinite for a plane
     [m]."""
+    convex: Flags
+    """(n_obstacles,) which are convex: every simple shape is."""
     friction: Floats
     """(n_obstacles,) Coulomb coefficient against the rod."""
     compliance: Floats

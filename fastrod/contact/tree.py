@@ -16,6 +16,7 @@ from fastrod.kernels.contact.bvh import LEAF_CODE
 from fastrod.types import Floats, Ints, Surfaces
 
 _LEAF = 4  # triangles at most
+_EVEN = 1e-8  # of a mesh's size: a neighbour that rises less above a face does not
 
 
 def pack(obstacles: Sequence[Obstacle], by_fcl: bool = False) -> Surfaces:
@@ -45,6 +46,7 @@ def pack(obstacles: Sequence[Obstacle], by_fcl: bool = False) -> Surfaces:
         primitive=addresses(obstacles, by_fcl),
         size=np.array([_size(o, by_fcl) for o in obstacles], float).reshape(-1, 3),
         sphere=np.array([_ball(o) for o in obstacles], float).reshape(-1, 4),
+        convex=np.array([_is_convex(o) for o in obstacles], bool),
         friction=np.array([o.friction for o in obstacles], float),
         compliance=np.array([1.0 / o.stiffness for o in obstacles], float),
         body=np.arange(len(obstacles)),
@@ -81,6 +83,19 @@ def _ball(o: Obstacle) -> tuple[float, float, float, float]:
         centre = 0.5 * (low + high)
         return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))
     return 0.0, 0.0, 0.0, primitive_of(o.shape).radius(o.size)
+
+
+@lru_cache(maxsize=64)
+def _is_convex(o: Obstacle) -> bool:
+    """A simple shape is. A mesh is where no face's neighbour rises above it, and its surface is one sphere
+    (Euler: corners - edges + faces = 2)."""
+    if o.shape != "mesh":
+        return True
+    import trimesh
+
+    mesh = trimesh.Trimesh(o.vertices, o.faces, process=False)
+    rises = mesh.face_adjacency_projections.max(initial=0.0)
+    return bool(mesh.euler_number == 2 and rises < _EVEN * mesh.scale)
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ import fastrod
 from fastrod.contact import ContactScene, box, mesh, plane, sphere
 from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
-from fastrod.kernels.contact.centreline import Curve
+from fastrod.kernels.contact.centreline import Curve, point_at
 from fastrod.kernels.contact.proximity import (
     UNSEEN,
     ProximityOptions,
@@ -29,6 +29,28 @@ def _search(curve, options, surfaces, frames, distance, position, work, found):
     return search_obstacles(
         ProximitySearch(curve, options, surfaces, frames, distance, position, work, found)
     )
+
+
+@njit()
+def _point(curve, j, fraction):
+    return point_at(curve, j, fraction)
+
+
+def _searched(curve, radius, nearest, surfaces, pose, found):
+    """How many candidates of one rod and one obstacle there are, and the smallest gap."""
+    options, n = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest), len(curve.arclength)
+    work = SearchWork(*(room[0] for room in search_work(1, n)))
+    frames = frames_of(np.array([[pose]], float))[0]
+    return _search(curve, options, surfaces, frames, np.full(n, -np.inf), np.zeros((n, 3)), work, found)
+
+
+def _arc(bend, s):
+    """Nodes of a rod that bends about x by so much [1/m]."""
+    angle, nothing = bend * s, np.zeros_like(s)
+    c, d, one = np.cos(angle), np.sin(angle), np.ones_like(s)
+    rotation = np.stack([one, nothing, nothing, nothing, c, -d, nothing, d, c], axis=1).reshape(-1, 3, 3)
+    position = np.stack([nothing, (c - 1.0) / max(bend, 1e-9), d / max(bend, 1e-9)], axis=1)
+    return Curve(position, rotation, np.stack([bend * one, nothing, nothing], axis=1), s)
 
 
 @pytest.mark.study
@@ -52,17 +74,7 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
         obstacle = mesh(trimesh.util.concatenate(balls))
         phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
         found = np.zeros(64, CANDIDATE)
-        options = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
-        count, gap = _search(
-            curve,
-            options,
-            pack([obstacle]),
-            frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0],
-            np.full(len(s), -np.inf),
-            np.zeros((len(s), 3)),
-            SearchWork(*(room[0] for room in search_work(1, len(s)))),
-            found,
-        )
+        count, gap = _searched(curve, radius, nearest, pack([obstacle]), [0.0, 0, 0, 1, 0, 0, 0], found)
         assert gap <= phi.min() - radius + UNSEEN
         dips = 1 + np.flatnonzero(
             (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
@@ -73,6 +85,40 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
             assert found["gap"][:count][near].min() <= phi[k] - radius + 1e-8
         hidden += len(dips)
     assert hidden > 20
+
+
+@pytest.mark.study
+def test_every_dip_beside_a_convex_obstacle_is_found(scenes):
+    """Hulls of a few points, and boxes, at a bent rod, where slopes spare most samples: as above."""
+    rng, dips_seen = np.random.default_rng(5), 0
+    for k in range(120):
+        bend, size = rng.uniform(0.0, 45.0), rng.uniform(0.004, 0.04, 3)
+        s, dense = np.array([0.0, 0.015, 0.03]), np.linspace(0.0, 0.03, 6001)
+        curve = _arc(bend, s)
+        line = np.array([_point(curve, int(z >= 0.015), z / 0.015 - int(z >= 0.015)) for z in dense])
+        hull = trimesh.convex.convex_hull(rng.normal(size=(int(rng.integers(5, 40)), 3)) * size)
+        obstacle = box(2.0 * size) if k % 3 == 0 else mesh(hull)
+        surfaces = pack([obstacle])
+        assert surfaces.convex.all()
+        radius, turn = rng.choice([0.001, 0.004]), rng.normal(size=4)
+        pose = np.concatenate([np.zeros(3), turn / np.linalg.norm(turn)])
+        beside = np.concatenate([rng.normal(size=2), [0.0]])
+        pose[:3] = line[rng.integers(1000, 5001)] + beside / np.linalg.norm(beside) * size.max() * 2.0
+        for _ in range(40):  # until it touches
+            gap = scenes.distances(obstacle, pose, line).min() - radius + rng.uniform(-1e-4, 5e-4)
+            pose[:3] -= gap * beside / np.linalg.norm(beside)
+        phi = scenes.distances(obstacle, pose, line)
+        for nearest in (False, True):
+            found = np.zeros(64, CANDIDATE)
+            count, gap = _searched(curve, radius, nearest, surfaces, pose, found)
+            assert gap <= phi.min() - radius + UNSEEN
+            for d in 1 + np.flatnonzero(
+                (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
+            ):
+                near = np.abs(found["arclength"][:count] - dense[d]) < 1.1e-3
+                assert nearest or (near.any() and found["gap"][:count][near].min() <= phi[d] - radius + 1e-8)
+                dips_seen += 1
+    assert dips_seen > 50
 
 
 def test_the_curve_of_contact_is_the_shape():

@@ -60,7 +60,7 @@ def search_robots(
     while r < len(rows):
         i = rows[r]
         through, s = -1, 0.0
-        if motion.tracked[i] and moved_far(i, motion):
+        if motion.tracked[i] and moved_far(i, motion, rods.first[i]):
             through, s = tunnelled(i, motion, rods.first[i], surfaces, own.stack)
         if through >= 0:
             n_found[r], motion.gap[i] = -1, 0.0

@@ -323,7 +323,7 @@ def add_walls(
     for c in range(count):
         contact = contacts[c]
         k = contact.obstacle
-        if k >= len(frames):
+        if k >= len(frames) or surfaces.convex[k]:
             continue
         p = (centre[c, 0], centre[c, 1], centre[c, 2])
         d, _, _ = signed_distance(k, frames[k], p, FAR, surfaces, stack)

@@ -90,23 +90,15 @@ def task_search_work(work: SearchWork, i: int) -> SearchWork:
 
 
 @inline
-def node_point(curve: Curve, j: int, start: int, fraction: float) -> Vec:
-    """Node j; for the first one the point where contact begins."""
-    return (
-        point_at(curve, j, fraction if j == start else 0.0)
-        if j < len(curve.arclength) - 1
-        else point_at(curve, j - 1, 1.0)
-    )
+def _node_place(curve: Curve, j: int, start: int, fraction: float) -> tuple[int, float]:
+    """Interval of node j and the fraction of it; for the first one those where contact begins."""
+    return (j, fraction if j == start else 0.0) if j < len(curve.arclength) - 1 else (j - 1, 1.0)
 
 
 @inline
-def node_tangent(curve: Curve, j: int, start: int, fraction: float) -> Vec:
-    """dr/ds at node j; for the first one at the point where contact begins."""
-    return (
-        tangent_at(curve, j, fraction if j == start else 0.0)
-        if j < len(curve.arclength) - 1
-        else tangent_at(curve, j - 1, 1.0)
-    )
+def node_point(curve: Curve, j: int, start: int, fraction: float) -> Vec:
+    """Node j; for the first one the point where contact begins."""
+    return point_at(curve, *_node_place(curve, j, start, fraction))
 
 
 @inline
@@ -193,6 +185,20 @@ def _may_hide(f0: float, f1: float, length: float, curvature: float, level: floa
     return 0.5 * (a + b) - 0.25 * fall - 0.25 * (b - a) * (b - a) / fall < level * level
 
 
+@kernel
+def _may_dip(
+    f0: float, f1: float, g0: float, g1: float, length: float, curvature: float, level: float
+) -> bool:
+    """The same of a convex obstacle, by the slopes at the ends, too: its distance bends down by no more than
+    the curve does, phi'' >= -|r''|, and so lies above both tangents less that much."""
+    bend = curvature * length
+    opens = g1 - g0 + bend
+    if opens <= 0.0:
+        return False
+    s = min(max((f0 - f1 + (g1 + 0.5 * bend) * length) / opens, 0.0), length)
+    return f0 + (g0 - 0.5 * curvature * s) * s < min(level, min(f0, f1) - UNSEEN)
+
+
 @inline
 def _curvature(curve: Curve, j: int) -> float:
     """Curvature of the centreline at node j [1/m]."""
@@ -222,7 +228,11 @@ def _search_interval(
             deep = min(f0, f1) < rho - 2.0 * UNSEEN
             fine = length > 2.0 * UNSEEN and m <= _DEEPEST and (x1 - x0 > _COARSE or not deep)
             level = rho + (smallest if options.nearest else 0.0) - UNSEEN
-            if fine and least < level - rho and _may_hide(f0, f1, length, curvature, level):
+            hides = fine and least < level - rho and _may_hide(f0, f1, length, curvature, level)
+            # (a node that was not measured has no slope)
+            if hides and surfaces.convex[k] and g0 != 0.0 and g1 != 0.0:
+                hides = _may_dip(f0, f1, g0, g1, length, curvature, level)
+            if hides:
                 x = 0.5 * (x0 + x1)
                 phi, normal, _ = signed_distance(k, frame, point_at(curve, j, x), FAR, surfaces, stack)
                 _put(sample[m + 1], x, phi, dot(normal, tangent_at(curve, j, x)))
@@ -265,7 +275,7 @@ def _search_nodes(
         p = node_point(curve, j, start, fraction)
         bound = FAR if work.known[j] < 0.0 else need + _RELAY * curve.arclength[n - 1]
         phi, normal, near = signed_distance(k, search.frames[k], p, bound, search.surfaces, work.stack)
-        slope = dot(normal, node_tangent(curve, j, start, fraction)) if near else 0.0
+        slope = dot(normal, tangent_at(curve, *_node_place(curve, j, start, fraction))) if near else 0.0
         work.phi[j], work.slope[j], work.least[j] = phi, slope, min(work.least[j], phi)
         if not near:
             continue

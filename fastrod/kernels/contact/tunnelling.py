@@ -9,25 +9,17 @@ from fastrod.types import ContactMotion, ContactRods, Floats, Records, Surfaces
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
-from ..vec import Vec, axpy, dot, sub
+from ..vec import Vec, add, axpy, dot, mul, sub
 from .bvh import FAR, Numbers
 from .centreline import curve_before, curve_of, interval_of, point_at
 from .contact_set import segment_at
-from .surface import ray_hit, signed_distance
+from .surface import ray_hit, rotation_of, signed_distance, to_obstacle
 
 
 @inline
 def carried(before: Floats, after: Floats, p: Vec) -> Vec:
     """ContactWorld point p after it has moved with a frame."""
-    x, y, z = p[0] - before[9], p[1] - before[10], p[2] - before[11]
-    a = before[0] * x + before[3] * y + before[6] * z
-    b = before[1] * x + before[4] * y + before[7] * z
-    c = before[2] * x + before[5] * y + before[8] * z
-    return (
-        after[0] * a + after[1] * b + after[2] * c + after[9],
-        after[3] * a + after[4] * b + after[5] * c + after[10],
-        after[6] * a + after[7] * b + after[8] * c + after[11],
-    )
+    return add(mul(rotation_of(after), to_obstacle(before, p)), (after[9], after[10], after[11]))
 
 
 @kernel
@@ -83,9 +75,12 @@ def tunnelled(
 
 
 @kernel
-def moved_far(i: int, motion: ContactMotion) -> bool:
-    """Some node of robot i has moved farther than it was away from all obstacles."""
+def moved_far(i: int, motion: ContactMotion, first: float) -> bool:
+    """Some node of robot i beyond the arclength `first` has moved farther than it was away from all
+    obstacles."""
     for j in range(motion.arclength.shape[1]):
+        if motion.arclength[i, j] <= first:  # not measured: it belongs to the mounting
+            continue
         p, q = motion.position[i, j], motion.measured_at[i, j]
         if not motion.distance[i, j] > math.sqrt(
             (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
