@@ -38,13 +38,15 @@ def renew_some(
     contacts: ContactSet,
     found: Records,
     n_found: Ints,
-    still: bool,
+    still: Flags,
 ) -> None:
     """The contacts of these robots for their next pass, from their candidates (`renew_contacts`)."""
     room = np.empty((contacts.contact.shape[1], 3)), np.empty(MOST_PLANES, WALL)
     stack = np.empty(2 * STACK)
     for r in range(len(rows)):
-        renew_contacts(rows[r], n_found[r], found[r], rods, surfaces, motion, contacts, room, still, stack)
+        renew_contacts(
+            rows[r], n_found[r], found[r], rods, surfaces, motion, contacts, room, still[rows[r]], stack
+        )
 
 
 @entry
@@ -84,7 +86,7 @@ def press_some(
     first: int,
     yielding: float,
     renew: Floats,
-    still: bool,
+    still: Flags,
     step: Floats,
     changed: Flags,
 ) -> None:
@@ -115,7 +117,7 @@ def press_some(
     every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        renewed = press(count, unknowns, contacts, pressing, renew[robot[start[k]]], still)
+        renewed = press(count, unknowns, contacts, pressing, renew[robot[start[k]]], still[robot[start[k]]])
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
             changed[i] = renewed

@@ -39,12 +39,13 @@ from fastrod.solver.settle import unloaded
 from fastrod.solver.stepper import PassShapes, copied
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
-_PASSES, _TO_REST = 8, 40  # at most, of a step in motion, and of one to a rest
+# passes at most; those in which contacts follow the places where the gap is least, and at most where each
+# step is shorter than so much of the one before: of a step in motion, and of one to a rest
+_IN_MOTION, _TO_REST, _FALLING = (8, 2, 2), (40, 4, 16), 0.7
+_STAYS = 0.02  # of an integration step: a contact that moves by less is where it was
 _SWINGS = 12  # steps back in which the steps must have become half as long
 _BACK_AND_FORTH, _SHORTEST = 2, 0.2  # swings after which steps are shortened, and by how much at most
 _FOLLOWING, _SETTLING = 8, 20  # first parts of a rest, or of `settle`, in which they do
-# passes in which contacts follow the places where the gap is least, in motion and to a rest
-_MOVING, _SEEKING = 2, 4
 # slips that a step uses are updated in so many passes, and in a rest after such a step [rad], to this [m]
 _RENEWING, _NEAR, _EXACTLY = 2, 1e-3, 5e-8
 _STILL = 1e-6  # rad: a Newton step below it is the last one
@@ -365,13 +366,15 @@ class TouchingRods(ModalRods):
         length = float(np.max(modal.params.rod_length))
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then = ContactSet(*(a.copy() for a in contacts))
-        most, moving = (_PASSES, _MOVING) if self.dynamics else (_TO_REST, _SEEKING)
-        moving = moving if follow else 0
+        most, moving, longest = _IN_MOTION if self.dynamics else _TO_REST
+        if not follow:
+            moving = longest = 0
         # last step, the least one that halved in time, and what the last leaves to be done [rad]
         size, least, over = np.full((3, n), np.inf)
         swings, taken, relaxed = np.zeros(n, np.int64), np.zeros_like(q), np.ones(n)
         deep, ok, gone = self._deep, np.zeros(n, bool), np.zeros(n, bool)
         changed, step = np.ones(n, bool), np.zeros_like(q)
+        falls, still = np.zeros((2, n), bool)
         contacts.contact["slid"][rows] = 0.0
         frames = engine.frames(*span)
         for count in range(most + 1):
@@ -398,12 +401,14 @@ class TouchingRods(ModalRods):
             if not len(left) or count == most:
                 self._note_nearest(left, near, n_found)
                 break
-            still, seen = count >= moving, (engine.rods, engine.surfaces, world, contacts)
+            if count >= moving:
+                still |= engine.whole_worlds(~falls) if count < longest else True
+            seen = engine.rods, engine.surfaces, world, contacts
             before = contacts.used.copy(), contacts.contact["arclength"].copy()
             self._renew(left, seen, near, n_found, still)
             if engine.rods_meet:
-                closer = 0.01 * _INSIDE if still else _SAME_GAP
-                search_worlds(engine.in_worlds(left), search._replace(closer=closer), True)
+                for some, closer in ((left[still[left]], 0.01 * _INSIDE), (left[~still[left]], _SAME_GAP)):
+                    search_worlds(engine.in_worlds(some), search._replace(closer=closer), True)
             modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
             yielding = (how.dt / self.stepper.time.dt) ** 2 if self.dynamics else 1.0
@@ -427,11 +432,13 @@ class TouchingRods(ModalRods):
             last, size[left] = size[left], np.abs(unit * step[left]).max(1)
             # contraction by the last two steps (Hairer and Wanner 1996, IV.8), of contacts that stay; of a
             # rest by short ones, for long ones may go away and back
-            known = (contacts.used == before[0]) & (contacts.contact["arclength"] == before[1]).all(1)
+            moved = np.abs(contacts.contact["arclength"] - before[1]).max(1)
+            known = (contacts.used == before[0]) & (moved <= _STAYS * engine.rods.spacing)
+            falls[left] = (size[left] < _FALLING * last) & known[left]
             short = last < (np.inf if self.dynamics else _NEAR)
             by = np.where(known[left] & short, np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
             over[left] = by / (1.0 - by) * size[left]
-            self._late[left] = np.maximum(size[left], self._late[left]) if still else 0.0
+            self._late[left] = np.where(still[left], np.maximum(size[left], self._late[left]), 0.0)
             self._passes[left] += 1
             swings += (step * taken).sum(1) < 0.0
             swings[size < np.maximum(0.5 * least, _STILL)] = 0
@@ -469,7 +476,7 @@ class TouchingRods(ModalRods):
                 least = found[int(np.argmin(found["gap"][: abs(n)]))]
                 self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
-    def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: bool) -> None:
+    def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: Flags) -> None:
         """`renew_some` on so many threads."""
 
         def renew(_: int, first: int, last: int) -> None:

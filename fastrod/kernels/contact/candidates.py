@@ -8,7 +8,7 @@ from ..jit import inline, kernel, take_next
 from ..rod.gather import pick
 from .bvh import Numbers
 from .centreline import curve_of, interval_of, point_at
-from .contact_set import ContactRules, add_walls, choose, measure, merge
+from .contact_set import ContactRules, add_walls, choose, is_alone, measure, merge
 from .proximity import ProximityOptions, ProximitySearch, search_obstacles, task_search_work
 from .tunnelling import face_entered_sides, moved_far, tunnelled
 
@@ -94,10 +94,10 @@ def renew_contacts(
     margin = motion.margin * rods.length[i]
     face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)
     # with friction a contact that compares the present gap with its own of a pass before leaves its place too
-    # late; without it, one that always follows swings between its neighbours
+    # late, and so does one alone; without it, one that always follows swings between its neighbours
     for c in range(contacts.used[i]):
         k = contact[c].obstacle
-        if k < len(frames) and surfaces.friction[k] > 0.0:
+        if k < len(frames) and (surfaces.friction[k] > 0.0 or is_alone(c, contacts.used[i], contact)):
             j, fraction = interval_of(curve, contact[c].arclength, 0)
             measure(contact[c], frames[k], point_at(curve, j, fraction), margin, surfaces, stack, wall)
     rules = ContactRules(

@@ -184,6 +184,15 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
 
 
 @kernel
+def is_alone(c: int, count: int, contacts: Records) -> bool:
+    """No other contact of the rod with this obstacle presses."""
+    for e in range(count):
+        if e != c and contacts[e].obstacle == contacts[c].obstacle and carries(contacts[e]):
+            return False
+    return True
+
+
+@kernel
 def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
     """An idle contact, open and beside one that presses: it is not wanted next."""
     if contacts[c].gap < 10.0 * rules.tolerance:
@@ -237,7 +246,7 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
 
 
 @kernel
-def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
+def _follow(contact: Record, candidate: Record, alone: bool, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
@@ -248,7 +257,7 @@ def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
         return False
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, (_BESIDE if rubs else _CLOSE) * rules.spacing)
-    if settles or not carries(contact):
+    if settles or (alone and not rubs) or not carries(contact):
         contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
         return True
     return False
@@ -295,7 +304,7 @@ def choose(n_found: int, found: Records, count: int, contacts: Records, rules: C
         near = _nearest(candidate, n, contacts, rules)
         if near >= 0:
             contacts[near].matched = True
-            if _follow(contacts[near], candidate, rules):
+            if _follow(contacts[near], candidate, is_alone(near, n, contacts), rules):
                 continue
             apart = _CLOSE * rules.spacing
         if k < rules.n_obstacles and compliant(k, rules.surfaces):
