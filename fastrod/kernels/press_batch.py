@@ -44,9 +44,8 @@ def renew_some(
     room = np.empty((contacts.contact.shape[1], 3)), np.empty(MOST_PLANES, WALL)
     stack = np.empty(2 * STACK)
     for r in range(len(rows)):
-        renew_contacts(
-            rows[r], n_found[r], found[r], rods, surfaces, motion, contacts, room, still[rows[r]], stack
-        )
+        i = rows[r]
+        renew_contacts(i, n_found[r], found[r], rods, surfaces, motion, contacts, room, still[i], stack)
 
 
 @entry

@@ -6,9 +6,9 @@ from fastrod.types import ContactMotion, ContactRods, ContactSet, Floats, Ints, 
 
 from ..jit import inline, kernel, take_next
 from ..rod.gather import pick
-from .bvh import Numbers
+from .bvh import FAR, Numbers
 from .centreline import curve_of, interval_of, point_at
-from .contact_set import ContactRules, add_walls, choose, is_alone, measure, merge
+from .contact_set import ContactRules, add_walls, choose, measure, merge, presses_beside
 from .proximity import ProximityOptions, ProximitySearch, search_obstacles, task_search_work
 from .tunnelling import face_entered_sides, moved_far, tunnelled
 
@@ -97,7 +97,8 @@ def renew_contacts(
     # late, and so does one alone; without it, one that always follows swings between its neighbours
     for c in range(contacts.used[i]):
         k = contact[c].obstacle
-        if k < len(frames) and (surfaces.friction[k] > 0.0 or is_alone(c, contacts.used[i], contact)):
+        alone = not presses_beside(c, contacts.used[i], contact, FAR)
+        if k < len(frames) and (surfaces.friction[k] > 0.0 or alone):
             j, fraction = interval_of(curve, contact[c].arclength, 0)
             measure(contact[c], frames[k], point_at(curve, j, fraction), margin, surfaces, stack, wall)
     rules = ContactRules(

@@ -184,21 +184,10 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
 
 
 @kernel
-def is_alone(c: int, count: int, contacts: Records) -> bool:
-    """No other contact of the rod with this obstacle presses."""
+def presses_beside(c: int, count: int, contacts: Records, within: float) -> bool:
+    """Another contact of the rod with the obstacle of contact c presses, so near along the rod [m]."""
     for e in range(count):
-        if e != c and contacts[e].obstacle == contacts[c].obstacle and carries(contacts[e]):
-            return False
-    return True
-
-
-@kernel
-def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
-    """An idle contact, open and beside one that presses: it is not wanted next."""
-    if contacts[c].gap < 10.0 * rules.tolerance:
-        return False
-    for e in range(count):
-        beside = abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
+        beside = e != c and abs(contacts[e].arclength - contacts[c].arclength) < within
         if beside and contacts[e].obstacle == contacts[c].obstacle and carries(contacts[e]):
             return True
     return False
@@ -218,7 +207,8 @@ def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
     for c in range(count):
         contact = contacts[c]
         idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
-        if rules.still or carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
+        spare = contact.gap >= 10.0 * rules.tolerance and presses_beside(c, count, contacts, rules.spacing)
+        if rules.still or carries(contact) or (idle and room and not spare):
             if n != c:
                 contacts[n] = contacts[c]
             contacts[n].matched = False
@@ -304,7 +294,7 @@ def choose(n_found: int, found: Records, count: int, contacts: Records, rules: C
         near = _nearest(candidate, n, contacts, rules)
         if near >= 0:
             contacts[near].matched = True
-            if _follow(contacts[near], candidate, is_alone(near, n, contacts), rules):
+            if _follow(contacts[near], candidate, not presses_beside(near, n, contacts, FAR), rules):
                 continue
             apart = _CLOSE * rules.spacing
         if k < rules.n_obstacles and compliant(k, rules.surfaces):
