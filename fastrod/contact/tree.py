@@ -87,15 +87,15 @@ def _ball(o: Obstacle) -> tuple[float, float, float, float]:
 
 @lru_cache(maxsize=64)
 def _is_convex(o: Obstacle) -> bool:
-    """A simple shape is. A mesh is where no face's neighbour rises above it, and its surface is one sphere
-    (Euler: corners - edges + faces = 2)."""
+    """A simple shape is. A mesh is where it is closed, no face's neighbour rises above it, and its surface is
+    one sphere (Euler: corners - edges + faces = 2)."""
     if o.shape != "mesh":
         return True
     import trimesh
 
     mesh = trimesh.Trimesh(o.vertices, o.faces, process=False)
     rises = mesh.face_adjacency_projections.max(initial=0.0)
-    return bool(mesh.euler_number == 2 and rises < _EVEN * mesh.scale)
+    return bool(o.closed and mesh.euler_number == 2 and rises < _EVEN * mesh.scale)
 
 
 @lru_cache(maxsize=64)

@@ -121,6 +121,26 @@ def test_every_dip_beside_a_convex_obstacle_is_found(scenes):
     assert dips_seen > 50
 
 
+def test_what_is_convex():
+    """Simple shapes and hulls; no hollow, no two bodies, nothing open, nothing seen from inside."""
+    ball, two = trimesh.creation.icosphere(subdivisions=1), [trimesh.creation.box() for _ in range(2)]
+    two[1].apply_translation([3.0, 0.0, 0.0])
+    lid, inside = ball.faces[ball.triangles_center[:, 2] > 0.5], ball.copy()
+    discs = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
+    inside.invert()
+    others = [
+        mesh(trimesh.creation.torus(1.0, 0.2)),
+        mesh(trimesh.creation.annulus(0.1, 0.2, 1.0)),
+        mesh(trimesh.util.concatenate(two)),
+        mesh((ball.vertices, lid), open_surface=True),
+        mesh((discs, np.array([[0, 1, 2], [3, 4, 5]])), open_surface=True),
+        mesh(inside, open_surface=True),
+    ]
+    same = [sphere(1.0), plane(), box((1.0, 2.0, 3.0)), mesh(ball), mesh(two[0])]
+    assert pack(same).convex.all()
+    assert not pack(others).convex.any()
+
+
 def test_the_curve_of_contact_is_the_shape():
     """At 6 steps a segment the curve that contact searches and `shape` agree between the nodes, in contact
     too."""
