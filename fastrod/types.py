@@ -196,7 +196,6 @@ CONTACT = _record(
     ("gap", np.float64),
     ("force", np.float64, (3,)),
     ("radius", np.float64),
-    ("shift", np.float64),
     ("held", np.float64, (3,)),
     ("slid", np.float64),
     ("place", np.float64, (3,)),
@@ -204,10 +203,9 @@ CONTACT = _record(
 )
 """One contact of a rod. obstacle: its index, from n_obstacles on a rod's; partner: number that both sides of
 a contact between rods share, or -1; arclength [m]; normal: toward the rod, world; gap [m]; force: on the
-rod, world [N]; radius: of the rod there [m]; shift: how far it moved along the rod the last time [m]; held:
-the part of the force along the surface at the last step's end, world [N]; slid: how far it has slipped in
-this one [m]; place: of the centreline in the obstacle when it was measured last [m]; matched: a candidate of
-this pass belongs to it."""
+rod, world [N]; radius: of the rod there [m]; held: the part of the force along the surface at the last step's
+end, world [N]; slid: how far it has slipped in this one [m]; place: of the centreline in the obstacle when it
+was measured last [m]; matched: a candidate of this pass belongs to it."""
 
 CANDIDATE = _record(
     ("obstacle", np.int64), ("arclength", np.float64), ("gap", np.float64), ("normal", np.float64, (3,))

@@ -76,7 +76,6 @@ def open_contact(contact: Record, obstacle: int, s: float, n: Vec, gap: float, r
     contact.obstacle, contact.partner = obstacle, -1
     contact.arclength, contact.gap, contact.radius = s, gap, radius
     set_normal(contact, n)
-    contact.shift = FAR
     contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
     contact.held[0], contact.held[1], contact.held[2] = 0.0, 0.0, 0.0
     contact.slid = NEW
@@ -240,17 +239,17 @@ def _follow(contact: Record, candidate: Record, alone: bool, rules: ContactRules
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
     rubs = rules.surfaces.friction[candidate.obstacle] > 0.0
-    near = 0.5 * rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
-    if candidate.gap >= contact.gap - near:
+    closer = 0.5 * rules.tolerance if rules.still else _SAME_GAP if rubs else 0.0
+    if candidate.gap >= contact.gap - closer:
         return True
     if rules.still:
         return False
-    away = abs(contact.arclength - candidate.arclength)
-    settles = away < max(0.5 * contact.shift, (_BESIDE if rubs else _CLOSE) * rules.spacing)
-    if settles or (alone and not rubs) or not carries(contact):
-        contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
-        return True
-    return False
+    beside = (_BESIDE if rubs else _CLOSE) * rules.spacing
+    near = abs(contact.arclength - candidate.arclength) < beside
+    follows = near or (alone and not rubs) or not carries(contact)
+    if follows:
+        contact.arclength = candidate.arclength
+    return follows
 
 
 @kernel
@@ -283,8 +282,8 @@ def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: Cont
 @kernel
 def choose(n_found: int, found: Records, count: int, contacts: Records, rules: ContactRules) -> int:
     """Contacts for the next pass, in place; returns how many. Those that press stay, and idle ones whose gap
-    is below `rules.keep`: they may be wanted next. A contact follows the minimum of the gap as long as its
-    shifts shrink; where they do not (a rod that hugs a curved surface), another is put beside it, and the law
+    is below `rules.keep`: they may be wanted next. A contact alone follows the least gap; where
+    there are several (a rod that hugs a curved surface), or friction, another is put beside it, and the law
     shares the force out."""
     n = _keep_wanted(count, contacts, rules)
     for f in range(n_found):
