@@ -341,7 +341,7 @@ def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedW
 
 @kernel
 def _body_of(k: int, surfaces: Surfaces) -> int:
-    """Number of the first obstacle of the body that obstacle k is scaled of: the numbers of bodies are the
+    """Number of the first obstacle of the body that obstacle k belongs to: the numbers of bodies are the
     user's."""
     first = k
     for other in range(k - 1, -1, -1):

@@ -189,8 +189,8 @@ def _may_hide(f0: float, f1: float, length: float, curvature: float, level: floa
 def _may_dip(
     f0: float, f1: float, g0: float, g1: float, length: float, curvature: float, level: float
 ) -> bool:
-    """The same of a convex obstacle, by the slopes at the ends, too: its distance bends down by no more than
-    the curve does, phi'' >= -|r''|, and so lies above both tangents less that much."""
+    """The same beside a convex obstacle, by the slopes g0 and g1 at the ends: along a straight line its
+    distance is convex, so that here phi'' >= -|r''|, and phi lies above both tangents less so much."""
     bend = curvature * length
     opens = g1 - g0 + bend
     if opens <= 0.0:

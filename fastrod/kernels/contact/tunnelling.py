@@ -18,7 +18,7 @@ from .surface import ray_hit, rotation_of, signed_distance, to_obstacle
 
 @inline
 def carried(before: Floats, after: Floats, p: Vec) -> Vec:
-    """ContactWorld point p after it has moved with a frame."""
+    """The world point p after it has moved with a frame, from `before` to `after` (12,) each."""
     return add(mul(rotation_of(after), to_obstacle(before, p)), (after[9], after[10], after[11]))
 
 
