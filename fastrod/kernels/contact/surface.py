@@ -70,8 +70,8 @@ def walls(
     found: Records,
 ) -> int:
     """Faces of obstacle k around the world point p, nearer than `limit` (`facing_planes`), normals in the
-    world; `nearest` is its distance. (What is convex has no corner: only its nearest face is around p.)"""
-    if surfaces.convex[k]:
+    world; `nearest` is its distance."""
+    if surfaces.primitive[k, 0] != 0:
         return 0
     n = facing_planes(to_obstacle(frame, p), limit, nearest, surfaces.root[k], surfaces, stack, found)
     for j in range(n):
