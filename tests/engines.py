@@ -66,7 +66,7 @@ class MujocoStage:
 
     # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and
     # velocity together
-    hop = 1.35
+    hop = 1.4
 
     def __init__(
         self, robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, contact_bodies=True, **options

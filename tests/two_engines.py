@@ -1,6 +1,7 @@
 """One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ def carried() -> tuple[Any, dict[str, Any]]:
     from fastrod_scenes.ur5.carried import OFFSET, soft_robot
 
     robot = soft_robot("carried", 2)
+    robot = replace(robot, segments=tuple(replace(s, damping_time=0.05) for s in robot.segments))
     return robot, dict(SegmentActions(robot).inputs(np.array([0.0, -OFFSET * BEND / 2.0, 0.0] * 2)))
 
 
@@ -76,7 +78,7 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
         block = world.createMultiBody(0.0, -1, -1, block_at().tolist(), **link)
         contact_bodies = [(block, 0)]
     base = BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER))
-    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0, dynamics=False)
+    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0)
     given = inputs(case)
     if case == CASES[3]:
         world.setJointMotorControl2(block, 0, world.VELOCITY_CONTROL, force=0.0)
@@ -113,7 +115,7 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     data = mujoco.MjData(model)
     MujocoArm(model, data).place(JOINTS)
     mount = {"position": (0.0, 0.0, ADAPTER), "contact_bodies": contact_bodies, "friction": 0.0}
-    rod = MujocoRod(robot, model, data, "tool0", dynamics=False, **mount)
+    rod = MujocoRod(robot, model, data, "tool0", **mount)
     given = inputs(case)
     return rod, lambda: rod.step(**given)
 

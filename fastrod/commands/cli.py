@@ -121,7 +121,7 @@ def replay(
     LOG: run log (.csv or .parquet), or the raw file of a measured set
     --robot R: a shipped robot's name or a path to a .toml; a measured set brings its own
     --run RUN: only this run of the log
-    --dynamics: in motion, with inertia and damping (needs line_density)
+    --dynamics: in motion, with inertia and damping (needs line_density or damping_time)
     --out DIR: where residuals.csv and replay.png go (default: LOG's name + _replay)
     """
     from rich.console import Console
@@ -173,7 +173,7 @@ def identify(
     --max-effects K: name this many at most, 0: fit the base model alone
     --free-camera: fit the camera's registration, marker offset and latency too
     --only-session: fit this session's zeros, registration and delay alone, of a robot identified before
-    --dynamics: fit and search in motion, with inertia and damping (needs line_density)
+    --dynamics: fit and search in motion, with inertia and damping (needs line_density or damping_time)
     --network: train a network on what is left, reported apart (needs fastrod[network])
     --out DIR: where the files go (default: LOG's name + _identified)
     --json: print report.json to stdout and nothing else; files only with --out

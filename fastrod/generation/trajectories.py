@@ -50,7 +50,8 @@ class Trajectories:
     force: float = 0.0
     """Radius of the ball of tip forces [N]; the force stays for an episode."""
     dynamics: bool = False
-    """The rod has inertia; every segment of the robot needs a line_density, or this raises `InputError`."""
+    """The rod has inertia; every segment of the robot needs a line_density, or a damping_time to move
+    without, or this raises `InputError`."""
 
     def __post_init__(self) -> None:
         check_number("steps", self.steps, Bound(least=1, most=10**6), whole=True)

@@ -43,26 +43,15 @@ class BodyContact(ABC):
     swings: where a contact lasts the body feels a mean of the last three forces instead (Newmark 1959), of
     which the coming one is a third.
 
-    The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping
-    would swing with what it pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body
-    is expected where tau dF of the last force has been taken off.
-
     After a step in which the rod's forces are not known it only stops the body, until that takes all it has.
     """
 
     def __init__(
-        self,
-        shapes: Sequence[CollisionShape],
-        mass: float,
-        inertia: Floats,
-        *,
-        dt: float,
-        relaxation: float,
-        friction: float,
+        self, shapes: Sequence[CollisionShape], mass: float, inertia: Floats, *, dt: float, friction: float
     ) -> None:
-        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `relaxation` tau [s];
-        `friction` of rod on the body."""
-        self.dt, self.relaxation = dt, relaxation
+        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `friction` of rod on the
+        body."""
+        self.dt = dt
         self.mass = mass
         """0: it does not move for the rod [kg]."""
         self._inertia: Floats = np.maximum(inertia, 1e-12)
@@ -102,7 +91,7 @@ class BodyContact(ABC):
             return 0.0, np.zeros((3, 3)), pose[:3]
         rotation = matrix_from_quaternion(pose[None, 3:])[0]
         by_force, by_moment = 1.0 / self.mass, rotation @ (rotation.T / self._inertia[:, None])
-        square = self._weight * self.dt**2 + self.relaxation * self.dt
+        square = self._weight * self.dt**2
         return square * by_force, square * by_moment, pose[:3]
 
     @final
@@ -115,11 +104,9 @@ class BodyContact(ABC):
         """
         motion = self.com()
         if self.mass > 0.0:
-            known = self._past - self.relaxation / self.dt * self._before
             by_force, by_moment, _ = self.mobility(motion.pose)
-            change = np.concatenate([by_force * known[:3], by_moment @ known[3:]])
-            per = 1.0 / (self._weight * self.dt + self.relaxation)
-            motion = motion._replace(velocity=motion.velocity + per * change)
+            change = np.concatenate([by_force * self._past[:3], by_moment @ self._past[3:]])
+            motion = motion._replace(velocity=motion.velocity + change / (self._weight * self.dt))
         pose = motion.after(self.dt)
         if self.mass > 0.0:
             pose[:3] += _LEFT * self.overlap(capsules)
@@ -144,8 +131,9 @@ class BodyContact(ABC):
             return np.zeros(6), com
         points, forces = _pushes(state, self.names)
         wrench = np.concatenate([forces.sum(0), cross(points - com, forces).sum(0)])
-        more = self.relaxation / self.dt * (wrench - self._before)
-        more += self._past - (1.0 - self._weight) * wrench
+        more = self._past - (1.0 - self._weight) * wrench
+        if not wrench.any():
+            more = np.zeros(6)
         along = wrench[:3] if wrench[:3].any() else self._before[:3]
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold

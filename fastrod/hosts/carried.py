@@ -7,12 +7,13 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
 
 from fastrod.contact import ContactScene
-from fastrod.errors import HostError, InputError, nearest
+from fastrod.errors import HostError, InputError, RobotError, nearest
 from fastrod.hosts.body_contact import BodyContact
 from fastrod.hosts.host import Host
 from fastrod.hosts.rod import INPUTS, Rod
@@ -21,6 +22,8 @@ from fastrod.rotation import cross
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
+
+_DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
 
 
 class CarriedRod(ABC):
@@ -31,9 +34,11 @@ class CarriedRod(ABC):
     body is pushed with it. Any other body meets the rod's capsules. The rod's weight is that in the gravity
     of the world at each step.
 
-    Rod and body move together within the step, at any ratio of their masses. A rod whose every segment has a
-    line_density moves with inertia, in contact too; one without density has neither mass nor weight, and a
-    line on stderr says so.
+    Rod and body move together within the step, at any ratio of their masses, with the rod's inertia. A rod
+    without line_density has neither mass nor weight, and a line on stderr says so. Where such a one may touch
+    bodies it creeps to its shape with its damping_time, 0.1 s if it states none: without mass and damping it
+    would swing with what it pushes for ever. With `dynamics=False` a rod that touches nothing is at rest at
+    every step, and its host feels its weight alone: for hosts that motors hold.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
     each.
@@ -118,16 +123,11 @@ class CarriedRod(ABC):
         self._look()
         inputs = _checked(inputs)
         begins = self.state is None
-        motion, freedom = self._host.motion(), self._host.freedom(self.dt)
-        state = self.state = self.rod.advance(
-            motion.pose,
-            motion.velocity,
-            self.dt,
-            inverse_inertia=freedom.inverse_inertia,
-            free_twist=freedom.twist,
-            **self._scene(),
-            **inputs,
-        )
+        motion, given = self._host.motion(), self._scene() | inputs
+        if self.rod.simulator.dynamics:
+            freedom = self._host.freedom(self.dt)
+            given |= {"inverse_inertia": freedom.inverse_inertia, "free_twist": freedom.twist}
+        state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given)
         if state.ok[0]:
             self.wrench = self.rod.wrench
             for contact in self.body_contacts:
@@ -184,30 +184,42 @@ def rod_of(
     max_contacts: int,
     points_per_segment: int,
     capsules_per_segment: int,
-    dynamics: bool | None,
+    dynamics: bool,
 ) -> Rod:
     """Build the rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
-    scene, densities = None, [segment.line_density for segment in robot.segments]
-    if dynamics is None:
-        by_energy = all(segment.mode != "paper" for segment in robot.segments)
-        dynamics = by_energy and min(densities) > 0.0
-    if not any(densities):
+    scene, weighs = None, any(s.line_density > 0.0 or s.lumps for s in robot.segments)
+    moves = dynamics and bool(weighs or body_contacts)
+    if not weighs:
         note_massless(robot.name)
+    if body_contacts and not dynamics:
+        raise InputError(
+            "contact_bodies were given with dynamics=False; a rod that touches moves, leave it out."
+        )
+    if moves:
+        if any(segment.mode == "paper" for segment in robot.segments):
+            raise RobotError(
+                f"robot {robot.name!r} is of mode 'paper', which has no energy to move or to touch with; "
+                "leave contact_bodies out and give dynamics=False."
+            )
+        segments = (
+            segment
+            if segment.line_density + segment.damping_time > 0.0
+            else replace(segment, damping_time=_DAMPING)
+            for segment in robot.segments
+        )
+        robot = replace(robot, segments=tuple(segments))
     if body_contacts:
         scene = ContactScene(
             obstacles=[shape.obstacle for body in body_contacts for shape in body.shapes],
             max_contacts=max_contacts,
         )
-    if dynamics:  # what it touches feels its inertia
-        for contact in body_contacts:
-            contact.relaxation = 0.0
     return Rod(
         robot,
         dt=dt,
         contact=scene,
         points_per_segment=points_per_segment,
         capsules_per_segment=capsules_per_segment,
-        dynamics=dynamics,
+        dynamics=moves,
     )
 
 
@@ -242,11 +254,10 @@ def check_bodies(contact_bodies: object) -> None:
         )
 
 
-def check_contact(relaxation: float, friction: float) -> None:
-    """Raises `InputError` for what is no relaxation [s], no friction coefficient."""
-    for name, value, unit in (("relaxation", relaxation, " s"), ("friction", friction, "")):
-        if not isinstance(value, (int, float, np.floating)) or not 0.0 <= value < np.inf:
-            raise InputError(f"{name} is {value!r}{unit}; it must be a number, zero or positive.")
+def check_contact(friction: float) -> None:
+    """Raises `InputError` for what is no friction coefficient."""
+    if not isinstance(friction, (int, float, np.floating)) or not 0.0 <= friction < np.inf:
+        raise InputError(f"friction is {friction!r}; it must be a number, zero or positive.")
 
 
 def _checked(inputs: dict[str, Any]) -> dict[str, Any]:

@@ -59,28 +59,34 @@ class BulletLink:
     def freedom(self, dt: float) -> Freedom:
         """By the masses alone, whatever motors and contacts hold: a base that gives way more than it does is
         the stable side, and one that is held feels the rod all the same. Of accelerations PyBullet tells
-        none: a body that flies has gravity's, others are taken to go on as they move."""
+        none. A body that flies has gravity's, joints those by gravity and what their motors exerted in the
+        last step; others, and joints without motors, are taken to go on as they move."""
         bullet, motion = self.bullet, self.motion()
         point, velocity = motion.pose[:3], motion.velocity.copy()
         n = bullet.getNumJoints(self.body)
         joints = [j for j in range(n) if bullet.getJointInfo(self.body, j)[2] != bullet.JOINT_FIXED]
         heavy = bullet.getDynamicsInfo(self.body, -1)[0] > 0.0
         if not heavy and joints and self.link >= 0:
-            return Freedom(self._by_joints(joints), velocity)
+            mobility, gained = self._by_joints(joints)
+            return Freedom(mobility, velocity + dt * gained)
         if not heavy:
             return Freedom(np.zeros((6, 6)), velocity)
         if not joints:
             velocity[:3] += dt * bullet.gravity
         return Freedom(self._alone(point), velocity)
 
-    def _by_joints(self, joints: list[int]) -> Floats:
-        """J M^-1 J^T of a body that stands."""
+    def _by_joints(self, joints: list[int]) -> tuple[Floats, Floats]:
+        """J M^-1 J^T of a body that stands, and the acceleration (6,) by its motors."""
         bullet, zeros = self.bullet, [0.0] * len(joints)
-        q = [state[0] for state in bullet.getJointStates(self.body, joints)]
+        q, rate, _, exerted = map(list, zip(*bullet.getJointStates(self.body, joints), strict=True))
         # its point is in the link's URDF frame, though PyBullet's guide has that of the centre of mass
         slopes = bullet.calculateJacobian(self.body, self.link, self._position.tolist(), q, zeros, zeros)
-        jacobian = np.concatenate(slopes)
-        return jacobian @ np.linalg.solve(np.array(bullet.calculateMassMatrix(self.body, q)), jacobian.T)
+        jacobian, unbalanced = np.concatenate(slopes), np.array(exerted)
+        if unbalanced.any():
+            unbalanced -= bullet.calculateInverseDynamics(self.body, q, rate, zeros)
+        each = np.column_stack([jacobian.T, unbalanced])
+        gained = jacobian @ np.linalg.solve(np.array(bullet.calculateMassMatrix(self.body, q)), each)
+        return gained[:, :6], gained[:, 6]
 
     def _alone(self, point: Floats) -> Floats:
         """Mobility of the link, or of the nearest before it that has a mass, as if nothing were joined to

@@ -24,10 +24,8 @@ from fastrod.types import Floats
 class BulletBodyContact(BodyContact):
     """Contact of a rod with a link (-1: the base) of a PyBullet body (`BodyContact`)."""
 
-    def __init__(
-        self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float
-    ) -> None:
-        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where the link has no shape
+    def __init__(self, bullet: Any, body: int, link: int = -1, *, dt: float, friction: float) -> None:
+        """`friction` of rod on the body. Raises `HostError` where the link has no shape
         to touch."""
         self.bullet = Bullet(bullet)
         self.bullet.check(body, link)
@@ -36,7 +34,7 @@ class BulletBodyContact(BodyContact):
         shapes = _shapes(self.bullet, body, link)
         if not shapes:
             raise HostError(f"link {link} of body {body} has no collision shape, so nothing can touch it.")
-        super().__init__(shapes, mass, np.asarray(inertia), dt=dt, relaxation=relaxation, friction=friction)
+        super().__init__(shapes, mass, np.asarray(inertia), dt=dt, friction=friction)
 
     def com(self) -> Motion:
         """Motion of the centre of mass' frame, not of the link's URDF frame."""
@@ -110,18 +108,16 @@ class MountedRod(CarriedRod):
         *,
         contact_bodies: Sequence[int | tuple[int, int]] = (),
         friction: float = 0.3,
-        relaxation: float = 0.1,
         points_per_segment: int = 10,
         capsules_per_segment: int = 10,
         max_contacts: int = 16,
-        dynamics: bool | None = None,
+        dynamics: bool = True,
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
         head_color: Sequence[float] | None = None,
     ) -> None:
         """`contact_bodies`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on
-        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `dynamics`: the
-        rod moves with inertia; left out, where it can (`CarriedRod`). The time step is the world's. Raises
-        `HostError`, `InputError`."""
+        them; `dynamics` as `CarriedRod` has it. The time step is the world's. Raises `HostError`,
+        `InputError`, `RobotError`."""
         if not isinstance(host, BulletLink):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
@@ -130,12 +126,11 @@ class MountedRod(CarriedRod):
         self.host, self.bullet = host, host.bullet
         check_robot(robot)
         check_gravity(robot, self._gravity(), "setGravity() in the world")
-        check_contact(relaxation, friction)
+        check_contact(friction)
         check_bodies(contact_bodies)
         links = [_link_of(t) for t in contact_bodies]
         self.body_contacts = [
-            BulletBodyContact(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction)
-            for body, link in links
+            BulletBodyContact(self.bullet, body, link, dt=self.dt, friction=friction) for body, link in links
         ]
         self.rod = rod_of(
             robot,

@@ -99,7 +99,7 @@ def add_capsules(
         )
     check_robot(robot)
     check_bodies(contact_bodies)
-    check_contact(0.0, friction)
+    check_contact(friction)
     if (
         isinstance(capsules_per_segment, bool)
         or not isinstance(capsules_per_segment, (int, np.integer))
@@ -162,23 +162,21 @@ class MujocoRod(CarriedRod):
         quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
         contact_bodies: Sequence[int | str] = (),
         friction: float = 0.3,
-        relaxation: float = 0.1,
         name: str = "rod",
         points_per_segment: int = 10,
         max_contacts: int = 16,
-        dynamics: bool | None = None,
+        dynamics: bool = True,
     ) -> None:
         """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion`
         (4,) w x y z, body_from_base. `contact_bodies`: names or numbers of bodies; `friction` of the rod on
-        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `name` as given to
-        `add_capsules`. `dynamics`: the rod moves with inertia; left out, where it can (`CarriedRod`). The
-        time step is the model's. Raises `HostError`, `InputError`."""
+        them; `dynamics` as `CarriedRod` has it. `name` as given to `add_capsules`. The time step is the
+        model's. Raises `HostError`, `InputError`, `RobotError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
         self.host, self.model, self.data = host, model, data
         check_gravity(robot, self._gravity(), "set model.opt.gravity")
-        check_contact(relaxation, friction)
+        check_contact(friction)
         check_bodies(contact_bodies)
         others = [body_number(model, other) for other in contact_bodies]
         self.capsule_bodies: list[int] = _capsule_bodies(model, name, robot)
@@ -188,10 +186,7 @@ class MujocoRod(CarriedRod):
         _check_fit(model.geom_size[self._geoms], robot, name)
         for other in others:
             self._check_excluded(other, name)
-        self._bodies = [
-            MujocoBodyContact(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction)
-            for b in others
-        ]
+        self._bodies = [MujocoBodyContact(model, data, b, dt=self.dt, friction=friction) for b in others]
         self.body_contacts = self._bodies
         per_segment = len(self._geoms) // robot.n_segments
         self.rod = rod_of(
@@ -199,9 +194,9 @@ class MujocoRod(CarriedRod):
             self.body_contacts,
             dt=self.dt,
             max_contacts=max_contacts,
-            dynamics=dynamics,
             points_per_segment=points_per_segment,
             capsules_per_segment=per_segment,
+            dynamics=dynamics,
         )
         self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
         self._width = _sizes(robot, per_segment)[1]

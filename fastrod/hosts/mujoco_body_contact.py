@@ -23,11 +23,8 @@ class MujocoBodyContact(BodyContact):
     """Contact of a rod with a body of a MuJoCo model (`BodyContact`). Poses and velocities are as `data` have
     them: `MujocoBody.motion` has brought them up to date."""
 
-    def __init__(
-        self, model: Any, data: Any, body: int, *, dt: float, relaxation: float, friction: float
-    ) -> None:
-        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where no geom of the body
-        collides."""
+    def __init__(self, model: Any, data: Any, body: int, *, dt: float, friction: float) -> None:
+        """`friction` of rod on the body. Raises `HostError` where no geom of the body collides."""
         self.model, self.data, self.body = model, data, body
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self.geoms: list[int] = np.flatnonzero(solid & (model.geom_bodyid == body)).tolist()
@@ -39,9 +36,7 @@ class MujocoBodyContact(BodyContact):
         mass = 0.0 if still else float(model.body_mass[body])
         shapes = _shapes(model, body, self.geoms)
         self._applied = Applied(data, body)
-        super().__init__(
-            shapes, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction
-        )
+        super().__init__(shapes, mass, model.body_inertia[body].copy(), dt=dt, friction=friction)
 
     def com(self) -> Motion:
         """Motion of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 from fastrod.contact import ContactScene
 from fastrod.contact.frames import between
 from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
-from fastrod.hosts.capsules import Capsules, along, moved, rigid_exchange, rigid_inertia
+from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Freedom, Motion
 from fastrod.model.robot import Robot
-from fastrod.rotation import displaced, displacement, quaternion_from_matrix
+from fastrod.rotation import quaternion_from_matrix
 from fastrod.simulator import Simulator
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_shape
@@ -57,8 +57,6 @@ class RodSnapshot(NamedTuple):
     """(n_robots,) robots that settle before the next step."""
     still: Flags
     """(n_robots,) robots that came to rest: they begin with their base's motion."""
-    carried: Motion
-    """Base and velocity that the rod's mass assumes."""
 
 
 @final
@@ -156,7 +154,6 @@ class Rod:
         self._failed: Ints = np.zeros(self.simulator.n_robots, np.int64)
         self._fresh: Flags = np.zeros(self.simulator.n_robots, bool)
         self._still: Flags = np.ones(self.simulator.n_robots, bool)
-        self._carried = Motion(self._base.copy(), self._wrench.copy())
 
     @property
     def state(self) -> State:
@@ -228,9 +225,8 @@ class Rod:
         A base that gives way: `inverse_inertia` (6, 6), J M^-1 J^T of the engine at the base point, its
         linear and angular acceleration by force and moment, world; `free_twist` (6,) its velocity at the
         step's end if there were no rod, `base_twist` if left out. The rod and its base then move together,
-        stably at any ratio of masses, the rod in one step of `time_step`: with `dynamics` by its inertia,
-        without it by that of its shape as a rigid body. The engine is to feel `wrench` in this step, about
-        the base point where it is before it.
+        stably at any ratio of masses, the rod in one step of `time_step`; one with mass needs `dynamics`.
+        The engine is to feel `wrench` in this step, about the base point where it is before it.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
         it stopped, with half the wrench of the engine's step before; after a few in a row the rod settles
@@ -265,10 +261,6 @@ class Rod:
             settle(motion.pose, begins, around)
         self.simulator.dt = h = time_step / n
         if self._still.any():
-            still = self._still[:, None]
-            self._carried = Motion(
-                *(np.where(still, a, b) for a, b in zip(motion, self._carried, strict=True))
-            )
             if self.simulator.dynamics:
                 # an engine's velocity is that of the middle of its last step
                 middle = 0.5 * (motion.velocity + free.velocity)
@@ -278,26 +270,11 @@ class Rod:
         for k in range(n):
             obstacles = self._obstacles_after(around, n - k) if n > 1 else around
             self._solved(free.after((k + 1) * h), given, obstacles, 0.5 * wrench, mobility)
-        if freedom is not None and self._weighs and not self.simulator.dynamics:
-            self._as_rigid_body(motion, free.after(h), freedom.inverse_inertia, h)
         before, self._capsules = self._capsules, self._along(self.state)
         if before is not None:
             self._capsules = moved(before, self._capsules, time_step)
         self.time += time_step
         return self.state
-
-    def _as_rigid_body(self, motion: Motion, free: Floats, mobility: Floats, dt: float) -> None:
-        """Let a rod without inertia of its own have that of its shape as a rigid body, whose base is where,
-        and as fast as, the rod last took it to be."""
-        pose, velocity = self._carried
-        by = displacement(pose, np.broadcast_to(free, pose.shape))
-        inertia = rigid_inertia(self.robot, self.state.position)
-        mean = rigid_exchange(inertia, mobility, self._wrench, velocity, by, dt)
-        mean = np.where(self.state.ok[:, None], mean, self._wrench)
-        moved = by + dt * dt * np.einsum("nij,nj->ni", mobility, mean)
-        self._carried = Motion(displaced(pose, moved), moved / dt)
-        mean[:, 3:] += np.cross(free[..., :3] - motion.pose[..., :3], mean[:, :3])
-        self._wrench = mean
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put
@@ -332,7 +309,6 @@ class Rod:
             self._failed.copy(),
             self._fresh.copy(),
             self._still.copy(),
-            self._carried,
         )
 
     def restore(self, snapshot: RodSnapshot) -> None:
@@ -345,7 +321,7 @@ class Rod:
         self.time, self._state, self._capsules = snapshot.time, snapshot.state, snapshot.capsules
         self._failed, self._fresh = snapshot.failed.copy(), snapshot.fresh.copy()
         self._wrench, self._base = snapshot.wrench.copy(), snapshot.base.copy()
-        self._still, self._carried = snapshot.still.copy(), snapshot.carried
+        self._still = snapshot.still.copy()
         self._inputs, self._obstacles = dict(snapshot.inputs), dict(snapshot.obstacles)
 
     def _settled(self, base: Floats, given: Given, around: Given) -> State:
@@ -503,6 +479,11 @@ class Rod:
             return None
         twist = motion.velocity if free_twist is None else self._twists(free_twist)
         given = checked_mobility(inverse_inertia, self.simulator.n_robots)
+        if self._weighs and not self.simulator.dynamics:
+            raise InputError(
+                "inverse_inertia was given, and this rod has a mass, which its base must feel; give "
+                "Rod(robot, dynamics=True)."
+            )
         return Freedom(given, np.broadcast_to(twist, motion.velocity.shape))
 
     def _poses(self, base_pose: ArrayLike) -> Floats:

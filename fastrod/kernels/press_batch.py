@@ -116,7 +116,8 @@ def press_some(
     every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
-        renewed = press(count, unknowns, contacts, pressing, renew[robot[start[k]]], still[robot[start[k]]])
+        i, own = robot[start[k]], n_q * (start[k + 1] - start[k])
+        renewed = press(count, unknowns, own, contacts, pressing, renew[i], still[i])
         for o in range(start[k + 1] - start[k]):
             i = robot[start[k] + o]
             changed[i] = renewed

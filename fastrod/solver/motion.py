@@ -72,15 +72,16 @@ class ModalRods:
         outputs: Literal["full", "tip"],
         threads: int,
     ) -> None:
-        """Raises `InputError` where a robot has no mass for `dynamics`, or is of mode `paper`."""
+        """Raises `InputError` where a robot has neither mass nor damping for `dynamics`, or is of mode
+        `paper`."""
         if layout.paper:
             raise InputError("mode 'paper' has no energy, and so no modes; take solver='observer'.")
         for robot in robots if options.dynamics else ():
             for k, segment in enumerate(robot.segments):
-                if not segment.line_density > 0.0:
+                if not segment.line_density + segment.damping_time > 0.0:
                     raise InputError(
                         f"segment {k + 1} of {robot.name!r} has line_density 0 kg/m, and dynamics=True "
-                        "needs a mass; give it one."
+                        "needs a mass; give it one, or a damping_time [s] to move without."
                     )
         self.options, self.robots, self.outputs, self.threads = options, robots, outputs, threads
         self.dynamics, self.n_robots = options.dynamics, n_robots

@@ -87,6 +87,7 @@ class TouchingRods(ModalRods):
         self._nearest: dict[int, tuple[int, float]] = {}  # obstacle, and arclength [m]
         self._late = np.zeros(self.n_robots)  # largest step since contacts stayed where they were [rad]
         self._deep = np.zeros(self.n_robots)  # in what they touch, at the end of the last try [m]
+        self._resting = False  # steps lead to a rest
 
     def replace(self, robots: Sequence[Robot]) -> None:
         """Take other robots of the same layout; a recording ends."""
@@ -227,6 +228,7 @@ class TouchingRods(ModalRods):
             engine.slips_from = engine.before, engine.poses_before
         ok, done, fraction, left = np.zeros(n, bool), np.zeros(n), np.ones(n), rows
         size, there, grows = np.where(cold, _FIRST, _RESTS), np.zeros(n, np.int64), np.full(n, _GROWS)
+        self._resting = True
         for _ in range(_MOST_STEPS if len(left) else 0):
             aim = np.minimum(done + fraction, 1.0)
             follow = there < (_FOLLOWING if tolerance >= AT_REST else _SETTLING)
@@ -257,7 +259,7 @@ class TouchingRods(ModalRods):
             left = left[self._passes[left] < engine.scene.max_iterations]
             if not len(left):
                 break
-        engine.slides[rows], engine.slips_from = True, None
+        engine.slides[rows], engine.slips_from, self._resting = True, None, False
         end_some(rows[ok[rows]], engine.contact_set, True)
         self._hold_up(rows)
         return ok
@@ -366,7 +368,8 @@ class TouchingRods(ModalRods):
         length = float(np.max(modal.params.rod_length))
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then = ContactSet(*(a.copy() for a in contacts))
-        most, moving, longest = _IN_MOTION if self.dynamics else _TO_REST
+        moves = self.dynamics and not self._resting
+        most, moving, longest = _IN_MOTION if moves else _TO_REST
         if not follow:
             moving = longest = 0
         # last step, the least one that halved in time, and what the last leaves to be done [rad]
@@ -390,7 +393,7 @@ class TouchingRods(ModalRods):
             violations(worlds, search, engine.surfaces, near, n_found, deep)
             if self._is_rigid:  # the whole rod, and not what its candidates show
                 np.maximum(deep, -engine.clearance.gap, out=deep)
-            if count and not self.dynamics:  # who asks for the rest tries a shorter step
+            if count and not moves:  # who asks for the rest tries a shorter step
                 gone |= engine.whole_worlds(through)
                 self._note_nearest(left[gone[left]], near[gone[left]], n_found[gone[left]])
                 left, near, n_found = left[~gone[left]], near[~gone[left]], n_found[~gone[left]]
@@ -411,7 +414,8 @@ class TouchingRods(ModalRods):
                     search_worlds(engine.in_worlds(some), search._replace(closer=closer), True)
             modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
-            yielding = (how.dt / self.stepper.time.dt) ** 2 if self.dynamics else 1.0
+            # a body gives way within one step of its engine, however long those to a rest are
+            yielding = (how.dt / self.stepper.time.dt) ** 2 if moves else 1.0
             model = (
                 d.hessian,
                 d.gradient,
@@ -421,7 +425,7 @@ class TouchingRods(ModalRods):
                 yielding,
             )
             renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
-            renew[size < (0.0 if self.dynamics else _NEAR)] = _EXACTLY
+            renew[size < (0.0 if moves else _NEAR)] = _EXACTLY
             self._press(left, (*seen, *model, renew, still, step, changed))
             # steps that go back and forth, as where a normal swings with the rod: less of each, as the last
             # two say (Irons and Tuck 1969, after Aitken)
@@ -435,7 +439,7 @@ class TouchingRods(ModalRods):
             moved = np.abs(contacts.contact["arclength"] - before[1]).max(1)
             known = (contacts.used == before[0]) & (moved <= _STAYS * engine.rods.spacing)
             falls[left] = (size[left] < _FALLING * last) & known[left]
-            short = last < (np.inf if self.dynamics else _NEAR)
+            short = last < (np.inf if moves else _NEAR)
             by = np.where(known[left] & short, np.minimum(size[left] / np.maximum(last, 1e-300), 0.5), 0.5)
             over[left] = by / (1.0 - by) * size[left]
             self._late[left] = np.where(still[left], np.maximum(size[left], self._late[left]), 0.0)
@@ -451,7 +455,7 @@ class TouchingRods(ModalRods):
         if len(arrived := np.flatnonzero(ok)):
             modal.place_points(self._points(arrived, acting), ports.extension)
             # at rest what is shown has none of the inertia of the way there
-            ends = how if self.dynamics else how._replace(dt=_LONGEST)
+            ends = how if moves else how._replace(dt=_LONGEST)
             modal.hold(arrived, ports, *found, ends, q, True)
             end_some(arrived, contacts, engine.slips_from is None)
         failed = rows[~ok[rows]]

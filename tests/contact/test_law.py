@@ -13,8 +13,8 @@ from fastrod.types import CONTACT, ContactSet
 
 
 @njit()
-def _press(m, n, contacts, pressing):
-    return press(m, n, contacts, pressing, np.inf, True)
+def _press(m, n, own, contacts, pressing):
+    return press(m, n, own, contacts, pressing, np.inf, True)
 
 
 def world(rng, m, n, mu):
@@ -59,7 +59,7 @@ def test_forces_obey_the_law_and_balance_the_rod(m, n, mu):
     rng = np.random.default_rng(m)
     for _ in range(20):
         pressing, contacts = world(rng, m, n, mu), ContactSet(np.array([m]), np.zeros((1, m), CONTACT))
-        _press(m, n, contacts, pressing)
+        _press(m, n, n, contacts, pressing)
         force, step = contacts.contact["force"][0], pressing.step
         u = pressing.free + pressing.along @ step
         law = pressing.law
@@ -80,6 +80,24 @@ def test_a_model_without_a_minimum_is_damped_until_it_has_one():
     pressing = world(rng, 2, 6, 0.2)
     pressing.hessian[:] -= 1.5 * np.diag(pressing.hessian.diagonal())
     assert np.linalg.eigvalsh(pressing.hessian)[0] < 0.0
-    _press(2, 6, ContactSet(np.array([2]), np.zeros((1, 2), CONTACT)), pressing)
+    _press(2, 6, 6, ContactSet(np.array([2]), np.zeros((1, 2), CONTACT)), pressing)
     assert np.isfinite(pressing.step).all()
     assert np.abs(pressing.step).max() < 1e3
+
+
+def test_a_body_moves_by_its_mobility_though_the_rods_hessian_is_damped():
+    # P d = J^T lambda: by the forces alone, whatever it takes to make the rods' part definite
+    rng, m, own, n = np.random.default_rng(1), 3, 6, 9
+    pressing, contacts = world(rng, m, n, 0.2), ContactSet(np.array([m]), np.zeros((1, m), CONTACT))
+    pressing.hessian[own:], pressing.hessian[:, own:], pressing.gradient[own:] = 0.0, 0.0, 0.0
+    pressing.hessian[:own, :own] -= 1.5 * np.diag(pressing.hessian.diagonal()[:own])
+    body = np.array([4e3, 2e3, 50.0])
+    pressing.hessian[own:, own:] = np.diag(body)
+    pressing.free[:, 0] = -0.01
+    assert np.linalg.eigvalsh(pressing.hessian)[0] < 0.0
+    _press(m, n, own, contacts, pressing)
+    force = contacts.contact["force"][0]  # the axes are the world's
+    assert (force[:, 0] > 0.1).any()
+    assert_allclose(
+        pressing.step[own:] * body, np.einsum("mra,mr->a", pressing.along[..., own:], force), rtol=1e-6
+    )

@@ -175,6 +175,28 @@ def southwell(rate: float) -> float:
     return float(np.sqrt(eigh(stiffness, mass, eigvals_only=True)[0]) / (2.0 * math.pi))
 
 
+@pytest.mark.parametrize("scheme", ["bdf1", "bdf2", "generalized_alpha"])
+def test_a_rod_with_damping_and_no_mass_creeps(scheme: Any) -> None:
+    # tau y' + y = F l^3 / (3 EI): to first order in the step after a sudden load
+    tau, force = 0.05, 1e-4
+    segment = Segment(
+        length=0.07,
+        bending_stiffness=(0.0022, 0.0022),
+        torsional_stiffness=0.001,
+        mode="passive",
+        damping_time=tau,
+    )
+    rest, off = force * 0.07**3 / (3.0 * 0.0022), []
+    for dt in (5e-3, 2.5e-3):
+        sim = Simulator(Robot(name="light", segments=(segment,)), dt=dt, dynamics=True, scheme=scheme)
+        sim.settle()
+        y = [sim.step(tip_force=(force, 0.0, 0.0)).tip_position[0, 0] for _ in range(round(0.2 / dt))]
+        off.append(np.abs(np.array(y) / rest - 1.0 + np.exp(-dt * np.arange(1, len(y) + 1) / tau)).max())
+        assert not sim.momentum().any()
+    assert off[0] < 0.06
+    assert math.log2(off[0] / off[1]) > 0.8
+
+
 @pytest.mark.study
 def test_a_turning_cantilever_is_stiffer() -> None:
     """It lies along x and turns about z, up to speed within six periods; a force along z then lets go."""

@@ -67,7 +67,7 @@ def test_a_robot_that_states_another_gravity_is_not_mounted(stage, gravity):
 @pytest.mark.study(beyond=1)
 def test_a_load_that_no_rod_holds_leaves_the_shape(stage):
     robot = fastrod.load_robot("five_segment_reacher")
-    s = stage(robot, axis="x", cubes=[Cube(0.05, 0.1, [0.0, 0.5, 0.5])])
+    s = stage(robot, axis="x")
     rest = s.rod.step()
     for _ in range(4):
         state = s.rod.step(tip_force=(0.0, 0.0, -500.0))
@@ -99,8 +99,8 @@ def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it(stage):
     s.rod.settle()
     scene = ContactScene(obstacles=[plane(point=(0.07, 0, 0), normal=(-1, 0, 0), name="w")])
     alone = Simulator(robot, dt=s.dt, points_per_segment=10, contact=scene)
-    for k in range(40):
-        pull = robot.rest_tendon_length + 0.0002 * k * np.array([-1, 0, 1, 0, -2, 0, 2, 0])
+    for k in range(340):  # it creeps there in tenths of seconds
+        pull = robot.rest_tendon_length + 0.0002 * min(k, 40) * np.array([-1, 0, 1, 0, -2, 0, 2, 0])
         state, expected = s.rod.step(tendon_length=pull), alone.step(pull)
     assert state.ok[0]
     assert s.rod.wrench[0] < -0.1
@@ -151,6 +151,8 @@ def test_capsules_push_what_the_rod_has_no_contact_with_and_nothing_twice(stage)
     assert alone.velocity()[0] > 0.0
     assert np.abs(alone.rod.wrench).max() < 1e-9
     assert_allclose(MASS * touched.velocity()[:3], -pushed, atol=1e-9)
+    # out of it in one step, though the force is beyond what buckles the rod
+    assert touched.velocity()[0] == pytest.approx(0.008 / touched.dt, rel=1e-3)
 
 
 def test_time_step_that_changes_is_a_sentence(stage):
@@ -190,7 +192,7 @@ def test_rod_that_stays_lost_is_reported(stage, monkeypatch):
         s.rod.step()
 
 
-@pytest.mark.parametrize("option", [{"relaxation": -1}, {"friction": float("nan")}])
+@pytest.mark.parametrize("option", [{"friction": -1}, {"friction": float("nan")}])
 def test_contact_options_are_checked(stage, option):
     with pytest.raises(InputError, match=r"it must be a number, zero or positive\."):
         stage(soft_robot(), **option)

@@ -89,19 +89,17 @@ def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
 
 
 @pytest.mark.study
-@pytest.mark.parametrize("x", [0.135, 0.15, 0.162])
-def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, x):
-    mass, height = 0.02, 0.1
+@pytest.mark.parametrize(("x", "mass"), [(0.135, 0.02), (0.15, 0.02), (0.162, 0.02), (0.1, 0.1), (0.18, 0.1)])
+def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, x, mass):
+    height = 0.1
     cube = Cube(0.06, mass, [x, 0.0, height])
     s = stage(load_robot("five_segment_reacher"), dt=0.01, gravity=9.81, cubes=[cube])
     inertia, energy = mass * 0.06**2 / 6.0, []
     for _ in range(40):
-        known = s.rod.step().ok[0]
+        assert s.rod.step().ok[0]
         linear, angular = np.split(s.velocity(), 2)
         moving = 0.5 * (mass * linear @ linear + inertia * angular @ angular)
         energy.append(mass * 9.81 * s.position()[2] + moving)
-        # a rod whose forces are not known only stops what it touches
-        assert known or energy[-1] < energy[-2] * (1.0 + 1e-9)
     assert max(energy) < mass * 9.81 * height * (1.0 + 1e-6)
     assert min(energy[-5:]) < 0.9 * max(energy)  # what it hit took some
 

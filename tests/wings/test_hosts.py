@@ -116,6 +116,22 @@ def test_rod_follows_a_host_that_moves_and_rotates():
     assert_allclose(rod.state.tip_position[0], place + rotation @ rest, atol=1e-6)
 
 
+def test_a_base_that_motors_hold_is_where_its_link_is():
+    # the rod expects its base by gravity and the motors of the last step
+    world = empty_world(0.005, 9.81)
+    arm, q, _ = kuka(world, 3)
+    for j, angle in enumerate(q):
+        world.resetJointState(arm, j, angle)
+        world.setJointMotorControl2(arm, j, world.POSITION_CONTROL, angle, positionGain=0.3, force=300.0)
+    link = BulletLink(world, arm, len(q) - 1, **MOUNT)
+    robot = soft_robot(line_density=0.8, damping_time=0.05)
+    rod = MountedRod(robot, link)
+    for _ in range(300):
+        rod.step()
+    assert_allclose(rod.rod.base[:3], link.motion().pose[:3], atol=2e-6)
+    assert_allclose(rod.wrench[:3], [0.0, 0.0, -0.8 * robot.length * 9.81], atol=1e-4)
+
+
 def test_capsules_lie_along_the_backbone_and_rotate_with_it():
     world, robot = empty_world(), soft_robot()
     rod = MountedRod(robot, carrier(world), points_per_segment=10, capsules_per_segment=5)
@@ -212,7 +228,7 @@ NOT_THERE = {
 }
 BAD_INPUT = {
     r"3 capsules for 10 points of a segment; give a divisor of the points\.": mounted(capsules_per_segment=3),
-    r"relaxation is -1 s; it must be a number, zero or positive\.": mounted(relaxation=-1),
+    r"friction is -1; it must be a number, zero or positive\.": mounted(friction=-1),
     r"^gravity is 9.81; give three numbers": lambda w: connect(gravity=9.81),
     r"^dt is 0 s; it must be positive": lambda w: connect(dt=0),
 }

@@ -150,28 +150,26 @@ def test_a_pendulum_swings_with_its_rod(engine: str, mass: float, dt: float, tmp
 def test_a_held_base_bears_the_weight_and_the_inertia() -> None:
     """Whatever the engine says of its inverse inertia: what is held is always elsewhere than it would be."""
     robot = heavy(0.4)
-    for dynamics in (False, True):
-        rod = Rod(robot, dt=2e-3, dynamics=dynamics)
-        for _ in range(200):
-            rod.advance(HOME, np.zeros(6), 2e-3, inverse_inertia=np.diag([20.0] * 3 + [5e3] * 3))
-        assert_allclose(rod.wrench[:3], [0.0, 0.0, -0.4 * GRAVITY], atol=0.02)
-        pushed = Rod(robot, dt=2e-3, dynamics=dynamics)
-        for k in range(50):  # 5 m/s^2 along z
-            pose = displaced(HOME, 0.5 * 5.0 * 4e-6 * k * (k - 1) * np.eye(6)[2])
-            twist = 5.0 * 2e-3 * k * np.eye(6)[2]
-            pushed.advance(pose, twist, 2e-3, inverse_inertia=np.zeros((6, 6)))
-        assert_allclose(pushed.wrench[2], -0.4 * (GRAVITY + 5.0), rtol=1e-3)
+    rod = Rod(robot, dt=2e-3, dynamics=True)
+    for _ in range(200):
+        rod.advance(HOME, np.zeros(6), 2e-3, inverse_inertia=np.diag([20.0] * 3 + [5e3] * 3))
+    assert_allclose(rod.wrench[:3], [0.0, 0.0, -0.4 * GRAVITY], atol=0.02)
+    pushed = Rod(robot, dt=2e-3, dynamics=True)
+    for k in range(50):  # 5 m/s^2 along z
+        pose = displaced(HOME, 0.5 * 5.0 * 4e-6 * k * (k - 1) * np.eye(6)[2])
+        twist = 5.0 * 2e-3 * k * np.eye(6)[2]
+        pushed.advance(pose, twist, 2e-3, inverse_inertia=np.zeros((6, 6)))
+    assert_allclose(pushed.wrench[2], -0.4 * (GRAVITY + 5.0), rtol=1e-3)
 
 
-@pytest.mark.parametrize("dynamics", [True, False])
-def test_rods_of_a_batch_give_way_each_by_itself(dynamics: bool) -> None:
+def test_rods_of_a_batch_give_way_each_by_itself() -> None:
     """A light body, one that is held, a heavy one; and back to a snapshot."""
     robot, dt, n = heavy(0.2), 5e-3, 3
     mobility = np.stack(
         [np.diag([10.0] * 3 + [300.0] * 3), np.zeros((6, 6)), np.diag([2.0] * 3 + [50.0] * 3)]
     )
-    every = Rod(robot, dt=dt, n_robots=n, dynamics=dynamics)
-    single = [Rod(robot, dt=dt, dynamics=dynamics) for _ in range(n)]
+    every = Rod(robot, dt=dt, n_robots=n, dynamics=True)
+    single = [Rod(robot, dt=dt, dynamics=True) for _ in range(n)]
     pose, twist = np.tile(HOME, (n, 1)), np.zeros((n, 6))
     for k in range(8):
         length = robot.rest_tendon_length - 5e-4 * np.sin(0.3 * k) * np.eye(len(robot.rest_tendon_length))[0]

@@ -152,7 +152,7 @@ def test_every_geom_is_an_obstacle_where_it_is():
     refresh(model, data)
     for name in shapes:
         body, geoms = model.body(name).id, (model.geom("probe").id, model.geom(name).id)
-        contact = MujocoBodyContact(model, data, body, dt=0.005, relaxation=0.1, friction=0.3)
+        contact = MujocoBodyContact(model, data, body, dt=0.005, friction=0.3)
         assert [shape.obstacle.shape for shape in contact.shapes] == [name]
         clearance, points = clearance_of(contact)
         ends = []
@@ -307,7 +307,7 @@ def felt(inside, body):
     """Bodies of a model that a rod may touch."""
     model = spec_of(inside).compile()
     data, number = mujoco.MjData(model), model.body(body).id
-    MujocoBodyContact(model, data, number, dt=0.005, relaxation=0.1, friction=0.3)
+    MujocoBodyContact(model, data, number, dt=0.005, friction=0.3)
 
 
 def without_capsules():

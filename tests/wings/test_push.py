@@ -27,7 +27,7 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
         body = world.createMultiBody(
             1.0, shape, -1, [0.1, 0.2, 0.3], angle, baseInertialFramePosition=[0.01, 0.0, 0.0]
         )
-        contact = BulletBodyContact(world, body, dt=0.005, relaxation=0.1, friction=0.3)
+        contact = BulletBodyContact(world, body, dt=0.005, friction=0.3)
         assert [shape.obstacle.shape for shape in contact.shapes] == [name]
         clearance, points = clearance_of(contact)
         ends = []
@@ -45,7 +45,7 @@ def test_what_cannot_be_touched_is_a_sentence():
     ghost = world.createMultiBody(1.0, -1, -1, [0, 0, 0])
     sentence = r"link -1 of body 0 has no collision shape, so nothing can touch it\."
     with pytest.raises(HostError, match=sentence):
-        BulletBodyContact(world, ghost, dt=0.005, relaxation=0.1, friction=0.3)
+        BulletBodyContact(world, ghost, dt=0.005, friction=0.3)
     wall = plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")
     sim = Simulator(soft_robot(), contact=ContactScene(obstacles=[wall]))
     with pytest.raises(InputError, match=r"the mobility of 'wall' is .*; give \[m/N\], \(3, 3\)"):

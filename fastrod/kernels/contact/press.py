@@ -207,21 +207,15 @@ def _scale_softness(m: int, pressing: PressedWorld, by: float) -> None:
 
 
 @kernel
-def _make_convex(
-    n: int, m: int, contacts: ContactSet, pressing: PressedWorld, turned: bool, damping: float
-) -> None:
-    """Take from a Hessian with a negative pivot what the forces turn with their surfaces, or else add to its
-    diagonal."""
-    if turned:
-        _rotate_forces(m, n, contacts, pressing, -1.0)
-        return
-    for a in range(n):
-        pressing.hessian[a, a] += damping * abs(pressing.hessian[a, a])
-
-
-@kernel
 def _minimise(
-    m: int, n: int, contacts: ContactSet, pressing: PressedWorld, turned: bool, rounds: int, small: float
+    m: int,
+    n: int,
+    own: int,
+    contacts: ContactSet,
+    pressing: PressedWorld,
+    turned: bool,
+    rounds: int,
+    small: float,
 ) -> tuple[bool, bool]:
     """Newton's method from the present step until one changes it by less than `small` of itself: whether it
     has ended, and whether the forces still turn with their surfaces."""
@@ -229,7 +223,12 @@ def _minimise(
     stiff = pressing.room[4]
     for _ in range(rounds):
         while not _newton_step(m, n, pressing, to) and damping < _MOST_DAMPED:
-            _make_convex(n, m, contacts, pressing, turned, damping)
+            # not what the forces turn with their surfaces, or else more of the rods' diagonal: bodies begin
+            # every pass anew, and what held them would stay
+            for a in range(0 if turned else own):
+                pressing.hessian[a, a] += damping * abs(pressing.hessian[a, a])
+            if turned:
+                _rotate_forces(m, n, contacts, pressing, -1.0)
             damping, turned = damping if turned else _STIFFENS * damping, False
         for a in range(n):
             stiff[a] = 0.0
@@ -257,27 +256,29 @@ def _minimise(
 
 
 @kernel
-def press(m: int, n: int, contacts: ContactSet, pressing: PressedWorld, renew: float, still: bool) -> bool:
-    """Step and forces of a world with m contacts and n unknowns; whether a slip that the step uses has
-    changed, by more than `renew` [m] times its friction. `still`: contacts stay where they are. Where
-    Newton's method takes long (many contacts slip, in directions that they have yet to find), contacts are
-    soft first."""
+def press(
+    m: int, n: int, own: int, contacts: ContactSet, pressing: PressedWorld, renew: float, still: bool
+) -> bool:
+    """Step and forces of a world with m contacts and n unknowns, the rods' `own` first; whether a slip that
+    the step uses has changed, by more than `renew` [m] times its friction. `still`: contacts stay where they
+    are. Where Newton's method takes long (many contacts slip, in directions that they have yet to find),
+    contacts are soft first."""
     for a in range(n):
         pressing.step[a] = 0.0
     if not still:
         add_slides(m, n, contacts, pressing)
     turned = _rotate_forces(m, n, contacts, pressing, 1.0)
-    ended, turned = _minimise(m, n, contacts, pressing, turned, _FEW, _SMALL)
+    ended, turned = _minimise(m, n, own, contacts, pressing, turned, _FEW, _SMALL)
     if not ended:
         for a in range(n):
             pressing.step[a] = 0.0
         softer = _SOFTEST
         while softer > 1.0:
             _scale_softness(m, pressing, softer)
-            _, turned = _minimise(m, n, contacts, pressing, turned, _ROUNDS, _ROUGHLY)
+            _, turned = _minimise(m, n, own, contacts, pressing, turned, _ROUNDS, _ROUGHLY)
             _scale_softness(m, pressing, 1.0 / softer)
             softer *= _HARDENS
-        _minimise(m, n, contacts, pressing, turned, _ROUNDS, _SMALL)
+        _minimise(m, n, own, contacts, pressing, turned, _ROUNDS, _SMALL)
     return _report_forces(m, n, contacts, pressing, renew)
 
 
