@@ -38,7 +38,7 @@ class Contacts:
     """(n_robots, n) of the rod [m]."""
     wrench: Floats
     """(n_robots, n_obstacles, 6) on each obstacle by each robot: force [N], moment about the obstacle's
-    origin [N m]."""
+    origin [N m], world; of a body that gives way the mean over the step."""
     clearance: Floats
     """(n_robots,) smallest gap to anything; a lower bound where nothing is near [m]."""
     deep: Flags

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
+from fastrod.rotation import cross, displaced
 from fastrod.types import (
     CANDIDATE,
     CONTACT,
@@ -68,6 +70,10 @@ class Engine:
         self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
+        self.given_way: Floats | None = None
+        """(3, n_robots, n_obstacles, 6) of free bodies, in a step that is taken in parts: how far they are
+        from where they would be without the rods, displacement of the centre of mass and rotation, world [m,
+        rad]; by how much that grows in a whole step; and the mean wrench on them, as `Contacts.wrench`."""
         self.slips_from: tuple[RodShape, Floats] | None = None
         """Shape and obstacles from which slip is counted, where that is not from `before`."""
         self._broad: BroadPhase | None = None  # of scenes by FCL
@@ -94,11 +100,8 @@ class Engine:
         """For these robots the obstacles have not come from anywhere: they are where they are."""
         if rows.any() and self.poses is not self.poses_before:
             shape = (len(rows), *self.poses.shape[1:])
-            self.poses_before = np.where(
-                rows[:, None, None],
-                np.broadcast_to(self.poses, shape),
-                np.broadcast_to(self.poses_before, shape),
-            )
+            both = (np.broadcast_to(poses, shape) for poses in (self.poses, self.poses_before))
+            self.poses_before = np.where(rows[:, None, None], *both)
 
     def begin_anew(self, cold: Flags) -> None:
         """These robots have neither contacts nor a past."""
@@ -220,16 +223,18 @@ class Engine:
     def end_step(self, done: Floats) -> None:
         """The obstacles are at the end of their displacement; for a robot that came only the fraction `done`
         (n_robots,), where it met them."""
-        self.poses_before = (
-            self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
-        )
+        come = (done >= 1.0).all()
+        self.poses_before = self.poses if come else between(self.poses_before, self.poses, done)
 
     def contacts(self, shape: RodShape, ok: Flags) -> Contacts:
         """The contacts of a state."""
         thinnest = np.maximum(self.rods.radius.min(1), 1e-6)
-        return contacts_of(
-            self.scene.names, self.contact_set, self.clearance, self.poses, shape, ok, thinnest
-        )
+        known = self.scene.names, self.contact_set, self.clearance, self.poses
+        found = contacts_of(*known, shape, ok, thinnest)
+        if self.given_way is None:
+            return found
+        mean = self.given_way[2]
+        return replace(found, wrench=np.where(mean.any((1, 2), keepdims=True), mean, found.wrench))
 
     def thread_count(self, n: int) -> int:
         """Threads for n robots, or worlds."""
@@ -239,7 +244,8 @@ class Engine:
         """Frames of the obstacles at the fraction `aim` of their displacement, at `done`, which is behind,
         and where slip is counted from."""
         began = None if self.slips_from is None else self.slips_from[1]
-        if self.poses is self.poses_before and not self.velocities and began is None:
+        gives = self.given_way is not None
+        if self.poses is self.poses_before and not (self.velocities or gives) and began is None:
             still = frames_of(self.poses)
             return still, still, still
         poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
@@ -249,7 +255,33 @@ class Engine:
             slid = back_by(poses[:, k], velocity, self.dt * (aim - done if began is None else aim))
             ago = ago.repeat(len(slid) // len(ago), axis=0)
             ago[:, k] = slid
+        if self.given_way is not None:
+            way, speed = self.given_way[:2]
+            last, ago = self._aside(last, way), self._aside(ago, way)
+            poses = self._aside(poses, way + (aim - done)[:, None, None] * speed)
         return frames_of(poses), frames_of(last), frames_of(ago)
+
+    def _aside(self, poses: Floats, way: Floats) -> Floats:
+        """Poses of bodies that have given `way` (n_robots, n_obstacles, 6)."""
+        arm = poses[..., :3] - self.surfaces.mobility[:, 10:]
+        by = np.concatenate([way[..., :3] + cross(way[..., 3:], arm), way[..., 3:]], axis=-1)
+        return displaced(np.broadcast_to(poses, (*by.shape[:2], 7)), by)
+
+    def end_part(self, part: float, shape: RodShape, rows: Flags) -> None:
+        """Let free bodies feel the forces of these robots for this `part` of a step."""
+        if (given_way := self.given_way) is None:
+            return
+        self.given_way, mobility, body = None, self.surfaces.mobility, self.surfaces.body
+        wrench, self.given_way = self.contacts(shape, rows).wrench, given_way
+        moment = wrench[..., 3:] + cross(self.poses[..., :3] - mobility[:, 10:], wrench[..., :3])
+        turned = np.einsum("kij,nkj->nki", mobility[:, 1:10].reshape(-1, 3, 3), moment)
+        each = np.concatenate([mobility[:, :1] * wrench[..., :3], turned], axis=-1)
+        gained = np.einsum("kl,nli->nki", 1.0 * (body[:, None] == body), each)  # of all its obstacles
+        way, speed, mean = given_way
+        speed[rows] += part * gained[rows]
+        way[rows] += part * speed[rows]
+        mean[rows] += part * wrench[rows]
+        self.clearance.distance[rows] = -np.inf
 
     def motion(
         self, shape: RodShape, tolerance: float, frames: tuple[Floats, Floats, Floats]

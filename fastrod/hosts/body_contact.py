@@ -63,6 +63,7 @@ class BodyContact(ABC):
         self.exerted: Floats = np.zeros(6)
         """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step,
         world."""
+        self._poses: dict[str, Floats] = {}  # of its obstacles, as the step expects them
         self._before: Floats = np.zeros(6)
         self._lost = False  # the rod's forces of the last step were not known
         self._even = False  # the last force was like the one before it
@@ -117,6 +118,7 @@ class BodyContact(ABC):
             poses[shape.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], shape.quaternion)])
             linear = motion.velocity[:3] + cross(motion.velocity[3:], arm)
             velocities[shape.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
+        self._poses = poses
         return poses, velocities
 
     @final
@@ -129,8 +131,12 @@ class BodyContact(ABC):
         com = self.com().pose[:3]
         if self.mass == 0.0:
             return np.zeros(6), com
-        points, forces = _pushes(state, self.names)
-        wrench = np.concatenate([forces.sum(0), cross(points - com, forces).sum(0)])
+        wrench = np.zeros(6)
+        if (contacts := state.contacts) is not None:
+            for name in self.names:
+                found: Floats = contacts.wrench[0, contacts.names.index(name)]
+                wrench += found
+                wrench[3:] += cross(self._poses[name][:3] - com, found[:3])
         more = self._past - (1.0 - self._weight) * wrench
         if not wrench.any():
             more = np.zeros(6)
@@ -180,12 +186,3 @@ class BodyContact(ABC):
     def _exert(self) -> None:
         if self.exerted.any():
             self.apply(self.exerted)
-
-
-def _pushes(state: State, names: Sequence[str]) -> tuple[Floats, Floats]:
-    """Points and forces of the rod (n, 3) in the contacts with the obstacles of these names."""
-    contacts = state.contacts
-    if contacts is None:
-        return np.empty((0, 3)), np.empty((0, 3))
-    mine = np.isin(contacts.obstacle[0], [contacts.names.index(name) for name in names])
-    return contacts.point[0][mine], -contacts.force[0][mine]

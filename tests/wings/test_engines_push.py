@@ -7,6 +7,7 @@ from engines import BEYOND, ENGINES, MASS, RADIUS, SIZE, SPEED, Cube
 from numpy.testing import assert_allclose
 
 from fastrod import load_robot
+from fastrod.solver.touching import TouchingRods
 
 DISPLACEMENT = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
 END = {"axial": [BEYOND, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
@@ -46,6 +47,26 @@ def test_speed_of_a_free_cube_hardly_depends_on_the_step(stage):
     fine, *coarse = (push(stage, dt, "side", gravity=0.0, duration=0.4)[0][-1] for dt in (0.001, 0.005, 0.01))
     assert fine > 1.2 * SPEED
     assert_allclose(coarse, fine, rtol=0.012)  # where the cube took steps of implicit Euler, 2.1 %
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("direction", ["axial", "side"])
+def test_steps_in_parts_give_a_free_cube_the_speed_of_whole_ones(stage, direction, monkeypatch):
+    # the cube moves on from part to part, and feels the mean of their forces; parts are the finer steps
+    def speed(longest):
+        def one(rods, rows, acting, ports, how, *given):
+            if how.dt > longest and not rods._resting:
+                return np.zeros(rods.n_robots, bool)
+            return solved(rods, rows, acting, ports, how, *given)
+
+        monkeypatch.setattr(TouchingRods, "_one", one)
+        speeds, _, _, ok = push(stage, 0.01, direction, gravity=0.0, duration=0.25)
+        assert ok
+        return speeds[-1]
+
+    solved = TouchingRods._one
+    assert speed(6e-3) == pytest.approx(speed(1.0), rel=0.005)
+    assert speed(2e-3) == pytest.approx(speed(1.0), rel=0.01)
 
 
 @pytest.mark.study
