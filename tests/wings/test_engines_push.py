@@ -109,11 +109,22 @@ def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
     assert_allclose(momentum, -impulse[-1], atol=1e-9)
 
 
+FALLS = [  # at the last three a step is taken in parts
+    ((0.135, 0.0, 0.1), 0.02),
+    ((0.15, 0.0, 0.1), 0.02),
+    ((0.162, 0.0, 0.1), 0.02),
+    ((0.1, 0.0, 0.1), 0.1),
+    ((0.18, 0.0, 0.1), 0.1),
+    ((0.0523, -0.0055, 0.1438), 0.1),
+    ((0.0517, 0.0022, 0.1128), 0.1),
+    ((0.0566, 0.0051, 0.0632), 0.3),
+]
+
+
 @pytest.mark.study
-@pytest.mark.parametrize(("x", "mass"), [(0.135, 0.02), (0.15, 0.02), (0.162, 0.02), (0.1, 0.1), (0.18, 0.1)])
-def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, x, mass):
-    height = 0.1
-    cube = Cube(0.06, mass, [x, 0.0, height])
+@pytest.mark.parametrize(("place", "mass"), FALLS)
+def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, place, mass):
+    cube, height = Cube(0.06, mass, list(place)), place[2]
     s = stage(load_robot("five_segment_reacher"), dt=0.01, gravity=9.81, cubes=[cube])
     inertia, energy = mass * 0.06**2 / 6.0, []
     for _ in range(40):
