@@ -70,7 +70,7 @@ class Engine:
         self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
-        self.given_way: Floats | None = None
+        self.yielded: Floats | None = None
         """(3, n_robots, n_obstacles, 6) of free bodies, in a step that is taken in parts: how far they are
         from where they would be without the rods, displacement of the centre of mass and rotation, world [m,
         rad]; by how much that grows in a whole step; and the mean wrench on them, as `Contacts.wrench`."""
@@ -231,9 +231,9 @@ class Engine:
         thinnest = np.maximum(self.rods.radius.min(1), 1e-6)
         known = self.scene.names, self.contact_set, self.clearance, self.poses
         found = contacts_of(*known, shape, ok, thinnest)
-        if self.given_way is None:
+        if self.yielded is None:
             return found
-        mean = self.given_way[2]
+        mean = self.yielded[2]
         return replace(found, wrench=np.where(mean.any((1, 2), keepdims=True), mean, found.wrench))
 
     def thread_count(self, n: int) -> int:
@@ -244,8 +244,8 @@ class Engine:
         """Frames of the obstacles at the fraction `aim` of their displacement, at `done`, which is behind,
         and where slip is counted from."""
         began = None if self.slips_from is None else self.slips_from[1]
-        gives = self.given_way is not None
-        if self.poses is self.poses_before and not (self.velocities or gives) and began is None:
+        yields = self.yielded is not None
+        if self.poses is self.poses_before and not (self.velocities or yields) and began is None:
             still = frames_of(self.poses)
             return still, still, still
         poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
@@ -255,32 +255,32 @@ class Engine:
             slid = back_by(poses[:, k], velocity, self.dt * (aim - done if began is None else aim))
             ago = ago.repeat(len(slid) // len(ago), axis=0)
             ago[:, k] = slid
-        if self.given_way is not None:
-            way, speed = self.given_way[:2]
-            last, ago = self._aside(last, way), self._aside(ago, way)
-            poses = self._aside(poses, way + (aim - done)[:, None, None] * speed)
+        if self.yielded is not None:
+            off, speed = self.yielded[:2]
+            last, ago = self._aside(last, off), self._aside(ago, off)
+            poses = self._aside(poses, off + (aim - done)[:, None, None] * speed)
         return frames_of(poses), frames_of(last), frames_of(ago)
 
-    def _aside(self, poses: Floats, way: Floats) -> Floats:
-        """Poses of bodies that have given `way` (n_robots, n_obstacles, 6)."""
+    def _aside(self, poses: Floats, off: Floats) -> Floats:
+        """Poses of bodies that are so far `off` (n_robots, n_obstacles, 6)."""
         arm = poses[..., :3] - self.surfaces.mobility[:, 10:]
-        by = np.concatenate([way[..., :3] + cross(way[..., 3:], arm), way[..., 3:]], axis=-1)
+        by = np.concatenate([off[..., :3] + cross(off[..., 3:], arm), off[..., 3:]], axis=-1)
         return displaced(np.broadcast_to(poses, (*by.shape[:2], 7)), by)
 
-    def end_part(self, part: float, shape: RodShape, rows: Flags) -> None:
-        """Let free bodies feel the forces of these robots for this `part` of a step."""
-        if (given_way := self.given_way) is None:
+    def end_section(self, fraction: float, shape: RodShape, rows: Flags) -> None:
+        """Let free bodies feel the forces of these robots for this `fraction` of a step."""
+        if (yielded := self.yielded) is None:
             return
-        self.given_way, mobility, body = None, self.surfaces.mobility, self.surfaces.body
-        wrench, self.given_way = self.contacts(shape, rows).wrench, given_way
+        self.yielded, mobility, body = None, self.surfaces.mobility, self.surfaces.body
+        wrench, self.yielded = self.contacts(shape, rows).wrench, yielded
         moment = wrench[..., 3:] + cross(self.poses[..., :3] - mobility[:, 10:], wrench[..., :3])
         turned = np.einsum("kij,nkj->nki", mobility[:, 1:10].reshape(-1, 3, 3), moment)
         each = np.concatenate([mobility[:, :1] * wrench[..., :3], turned], axis=-1)
         gained = np.einsum("kl,nli->nki", 1.0 * (body[:, None] == body), each)  # of all its obstacles
-        way, speed, mean = given_way
-        speed[rows] += part * gained[rows]
-        way[rows] += part * speed[rows]
-        mean[rows] += part * wrench[rows]
+        off, speed, mean = yielded
+        speed[rows] += fraction * gained[rows]
+        off[rows] += fraction * speed[rows]
+        mean[rows] += fraction * wrench[rows]
         self.clearance.distance[rows] = -np.inf
 
     def motion(

@@ -149,7 +149,7 @@ class TouchingRods(ModalRods):
         """Let all this act on the robots; room for their shapes."""
         self._take(acting)
         self._passes[:], self._blocked[:], self._nearest = 0, False, {}
-        self.engine.given_way, self._resting = None, False
+        self.engine.yielded, self._resting = None, False
         return self._room(True)
 
     def end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
@@ -304,13 +304,13 @@ class TouchingRods(ModalRods):
         start, contacts = copied(motion), ContactSet(*(a.copy() for a in engine.contact_set))
         how = Step(BDF1, (last - first) * self.stepper.time.dt)
         ok = self._one(rows, acting, ports, how, (first * one, last * one), found, True)
-        engine.end_part(last - first, found.shape, ok)
+        engine.end_section(last - first, found.shape, ok)
         left = lost = rows[~ok[rows]]
         if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
-        if engine.given_way is None and engine.surfaces.mobility.any():
-            engine.given_way = np.zeros((3, n, *engine.surfaces.mobility.shape[:1], 6))
-        gave = None if engine.given_way is None else engine.given_way.copy()
+        if engine.yielded is None and engine.surfaces.mobility.any():
+            engine.yielded = np.zeros((3, n, *engine.surfaces.mobility.shape[:1], 6))
+        kept = None if engine.yielded is None else engine.yielded.copy()
         before, host, place = engine.before, self.modal.host, motion.place[:, :3].copy()
         aside, step, mean = (np.zeros_like(host.moved) for _ in range(3))
         for k in range(4):
@@ -335,8 +335,8 @@ class TouchingRods(ModalRods):
         back = lost[~ok[lost]]
         _put(motion, start, back)
         self._go_back(back, contacts)
-        if engine.given_way is not None and gave is not None:
-            engine.given_way[:, back] = gave[:, back]
+        if engine.yielded is not None and kept is not None:
+            engine.yielded[:, back] = kept[:, back]
         if before is not None and engine.before is not None:
             for array, then in zip(engine.before, before, strict=True):
                 array[lost] = then[lost]

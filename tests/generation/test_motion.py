@@ -94,7 +94,8 @@ def test_the_command_gives_a_robot_its_mass(tmp_path: Path, capsys: pytest.Captu
     assert cli.main(line.split()) == 2
     said = capsys.readouterr().err
     assert said.strip() == (
-        "segment 1 of 'prototype' has line_density 0 kg/m, and dynamics=True needs a mass; give it one."
+        "segment 1 of 'prototype' has line_density 0 kg/m, and dynamics=True needs a mass; give it one, or a "
+        "damping_time [s] to move without."
     )
     assert not list(tmp_path.iterdir())
     assert cli.main([*line.split(), "--line-density", "0.1"]) == 0
