@@ -24,8 +24,9 @@ class Cube(NamedTuple):
 class BulletStage:
     """`contact_bodies`: the cubes are obstacles of the rod; those without mass stand still."""
 
-    hop = 1.05
-    """Largest speed of a cube that is pushed over the floor, over that of the push."""
+    hop, hop_aside = 1.05, 1.05
+    """Largest speed of a cube that is pushed over the floor, along the rod and from its side, over that of
+    the push."""
 
     def __init__(
         self, robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, contact_bodies=True, **options
@@ -66,7 +67,7 @@ class MujocoStage:
 
     # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and
     # velocity together
-    hop = 1.4
+    hop, hop_aside = 1.35, 1.4
 
     def __init__(
         self, robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, contact_bodies=True, **options

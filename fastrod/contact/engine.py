@@ -244,8 +244,8 @@ class Engine:
         """Frames of the obstacles at the fraction `aim` of their displacement, at `done`, which is behind,
         and where slip is counted from."""
         began = None if self.slips_from is None else self.slips_from[1]
-        yields = self.yielded is not None
-        if self.poses is self.poses_before and not (self.velocities or yields) and began is None:
+        moves = self.velocities or self.yielded is not None or began is not None
+        if self.poses is self.poses_before and not moves:
             still = frames_of(self.poses)
             return still, still, still
         poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))

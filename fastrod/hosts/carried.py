@@ -193,7 +193,8 @@ def rod_of(
         note_massless(robot.name)
     if body_contacts and not dynamics:
         raise InputError(
-            "contact_bodies were given with dynamics=False; a rod that touches moves, leave it out."
+            "contact_bodies were given with dynamics=False; a rod that may touch bodies moves: leave "
+            "dynamics out."
         )
     if moves:
         if any(segment.mode == "paper" for segment in robot.segments):

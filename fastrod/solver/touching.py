@@ -309,7 +309,7 @@ class TouchingRods(ModalRods):
         if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
             return ok
         if engine.yielded is None and engine.surfaces.mobility.any():
-            engine.yielded = np.zeros((3, n, *engine.surfaces.mobility.shape[:1], 6))
+            engine.yielded = np.zeros((3, n, len(engine.surfaces.mobility), 6))
         kept = None if engine.yielded is None else engine.yielded.copy()
         before, host, place = engine.before, self.modal.host, motion.place[:, :3].copy()
         aside, step, mean = (np.zeros_like(host.moved) for _ in range(3))
