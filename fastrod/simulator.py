@@ -237,10 +237,8 @@ class Simulator(RobotBatch):
         for `step`. Without lengths or tensions the tendons are as at rest.
 
         Where Newton's method would diverge, the loads grow from none to all (load continuation). Robots that
-        still do not
-        converge have `ok` False and `passes` -1. In paper mode four tendons may contradict each other; then
-        the
-        least-squares boundary has converged, and `residual` says by how much they do.
+        still do not converge have `ok` False and `passes` -1. In paper mode four tendons may contradict each
+        other; then the least-squares boundary has converged, and `residual` says by how much they do.
 
         `rows` are indices of robots, or a mask: the others stay as they are, in the state as well; their
         inputs are not read. Not with a contact scene.

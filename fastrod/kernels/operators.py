@@ -1,9 +1,9 @@
 """Operators with memory on the lengths of the tendons: rows (robots or parameter sets) x steps x tendons.
 
 Each changes `x` (n_rows, n_steps, n_tendons) in place from command to effect and carries `memory` (n_rows,
-...)
-on; nan in the memory means that the tendon begins at rest at its first length. `dt` (n_steps,) is the time
-before each step [s]. Parameters have the shape (n_rows, n_tendons), so that every tendon may have its own.
+...) on; nan in the memory means that the tendon begins at rest at its first length. `dt` (n_steps,) is the
+time before each step [s]. Parameters have the shape (n_rows, n_tendons), so that every tendon may have its
+own.
 """
 
 from __future__ import annotations
@@ -142,8 +142,7 @@ def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt:
 def yielding(bend: Floats, memory: Floats, fraction: Floats, yield_at: Floats) -> None:
     """Plastic set of bends (n_rows, n_steps, n_segments, 2), in place: out b + c p, p dragged along once |b -
     p| exceeds y, in any direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; fraction
-    and
-    yield_at (n_rows, n_segments)."""
+    and yield_at (n_rows, n_segments)."""
     for r in range(bend.shape[0]):
         for k in range(bend.shape[2]):
             px, py = memory[r, 2 * k], memory[r, 2 * k + 1]

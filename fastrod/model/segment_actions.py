@@ -29,8 +29,7 @@ class SegmentActions:
     A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second
     toward +d2. The tendons of distal segments follow the bends and extensions of the segments that they
     cross, so every segment has its own action. Without load and with tendons that do not stretch, the
-    segments
-    are arcs of these bends.
+    segments are arcs of these bends.
 
     >>> import fastrod
     >>> actions = SegmentActions(fastrod.load_robot("prototype"))
@@ -40,9 +39,8 @@ class SegmentActions:
 
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
         """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first tendon
-        from
-        the backbone. Raises
-        `RobotError` where a segment is not driven by the lengths of two or more tendons around it."""
+        from the backbone. Raises `RobotError` where a segment is not driven by the lengths of two or more
+        tendons around it."""
         routing = route(robot)
         n = robot.n_segments
         offsets = np.full(n, offset, float) if offset else np.zeros(n)

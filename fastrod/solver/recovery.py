@@ -1,6 +1,5 @@
 """Robots whose observer pass diverged are settled on the same inputs; robots pressed beyond what a rod
-carries
-are not ok, however they were solved; the others keep every bit."""
+carries are not ok, however they were solved; the others keep every bit."""
 
 from __future__ import annotations
 
@@ -14,11 +13,9 @@ from fastrod.solver.settle import Pass, load_parameter, settle
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 TOLERANCE = 1e-9  # m: that of `Simulator.settle`
-# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of
-# those of
-# 50, and at most 2 % of those of 200. It is also three times pi^2, at which a segment whose ends the tendons
-# hold
-# buckles: a straight rod under more is solved to rounding, but no rod stands like that.
+# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those
+# of 50, and at most 2 % of those of 200. It is also three times pi^2, at which a segment whose ends the
+# tendons hold buckles: a straight rod under more is solved to rounding, but no rod stands like that.
 _HOPELESS = 30.0
 
 
@@ -71,9 +68,8 @@ def pressed(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Floats
     pulled.
 
     P is the internal force along the chord from base to tip, times chord / length, at that end where it
-    presses
-    less: all of the force where the rod is straight, little where it has buckled and stands in a stable
-    shape.
+    presses less: all of the force where the rod is straight, little where it has buckled and stands in a
+    stable shape.
     """
 
     def of(a: Floats) -> Floats:

@@ -198,9 +198,7 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
     """The unknowns no longer move.
 
     A small residual says little about tensions where tendons hardly stretch, and in paper mode the tendons
-    may
-    disagree:
-    then the least-squares boundary is the answer, and the residual says by how much they do.
+    may disagree: then the least-squares boundary is the answer, and the residual says by how much they do.
     """
 
     def of(a: Floats) -> Floats:
@@ -246,8 +244,7 @@ def _continuation(
 
 def _longest_load_step(rows: Ints, params: Params, ports: Ports) -> Floats:
     """Fraction of the loads that one step of the continuation may bring: more than a load parameter of three
-    could land
-    on another equilibrium."""
+    could land on another equilibrium."""
     return np.asarray(np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9)))
 
 

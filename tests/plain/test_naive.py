@@ -45,8 +45,7 @@ def test_settled_boundary_closes_in_the_twin_too(robot: Robot) -> None:
 
 def test_every_input_and_output_once() -> None:
     """Follower force, point force, extension, sampled load, slack tendon, Jacobian, compliance and dense
-    shape,
-    with indices checked."""
+    shape, with indices checked."""
     robot = chain()
     first, last = robot.segments
     slack = tuple(replace(t, unilateral=True, pretension=0.1) for t in last.tendons)

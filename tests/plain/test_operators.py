@@ -1,6 +1,5 @@
-"""The operators against their obvious twin: two rows, three tendons, every tendon with numbers of its own,
-in two
-calls."""
+"""The operators against their obvious twin: two rows, three tendons, every tendon with numbers of its own, in
+two calls."""
 
 from __future__ import annotations
 

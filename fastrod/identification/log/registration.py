@@ -101,8 +101,7 @@ def align(
     weights by distance).
 
     `rotations` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points
-    at
-    `lever` [m]. What the points do not determine, as the rotation about a line of them, stays zero.
+    at `lever` [m]. What the points do not determine, as the rotation about a line of them, stays zero.
     `mirrored`: the best improper rotation instead.
     """
     weight = np.ones(len(measured))

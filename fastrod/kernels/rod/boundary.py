@@ -20,8 +20,7 @@ from .workspace import Batch, Chunk, Mode, PassWorkspace
 @inline
 def slack_slope(params: Params, i: int, t: int) -> float:
     """Residual per unknown of a slack tendon of robot i: the unknown is then no tension but a measure of how
-    loose
-    it hangs, and d/T is about a taut one's slope."""
+    loose it hangs, and d/T is about a taut one's slope."""
     s = pick(i, len(params.rod_length))
     slope = params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s])
     return float(max(params.compliance[pick(i, len(params.compliance)), t], slope))

@@ -275,8 +275,7 @@ def write_summary(chunk: Chunk, output: Output, work: PassWorkspace) -> None:
 @kernel
 def write_response(chunk: Chunk, output: Output, work: PassWorkspace) -> None:
     """Residuals, and the change of residuals and tip by each column; a column has the tip's rotation in the
-    tip's
-    frame, `response` in the world's."""
+    tip's frame, `response` in the world's."""
     response, columns = output.response, work.sens.columns
     for w in range(chunk.n_robots):
         i = chunk.robots[w]

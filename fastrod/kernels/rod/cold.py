@@ -1,10 +1,8 @@
 """The guess that a cold start begins from, one robot at a time.
 
-    u of each segment, of least norm:    l (1 + u_x d_y - u_y d_x) = what is left there of each tendon that
-    ends
-    with it m(s) on these arcs:                  M + (r_tip - r) x F + sum over the loads beyond of (r_j - r)
-    x f_j, material frame T, of least norm about pretension:   sum of T (d_y, -d_x) = mean of m - K (u - u*)
-    over the segment, tip first
+    u of least norm in each segment:   l (1 + u_x d_y - u_y d_x) = what is left of each tendon that ends there
+    m(s) on these arcs, material:      M + (r_tip - r) x F + sum of (r_j - r) x f_j over the loads beyond
+    T of least norm about pretension:  sum of T (d_y, -d_x) = mean of m - K (u - u*) of a segment, tip first
 
 A tendon's (d_y, -d_x), the moment of its unit tension, is called its arm.
 """
@@ -26,10 +24,9 @@ SAMPLES = 8
 """Steps in which a segment's arc is sampled; the guess needs no more."""
 
 _RANK = 1e-3
-"""Fraction of the larger singular value below which the smaller counts as none: tendons that leave a plane
-by less,
-as two at 0 and 3.1416 do, say nothing about the bend across it, and a micrometre of their lengths would ask
-for curvatures beyond all bounds."""
+"""Fraction of the larger singular value below which the smaller counts as none: tendons that leave a plane by
+less, as two at 0 and 3.1416 do, say nothing about the bend across it, and a micrometre of their lengths would
+ask for curvatures beyond all bounds."""
 
 Axes: TypeAlias = tuple[float, float, float, float, float]
 
@@ -110,9 +107,8 @@ def _along(axes: Axes, dx: float, dy: float) -> tuple[float, float]:
 
 @kernel
 def _principal(offset: Floats, first: int, last: int) -> Axes:
-    """Principal axes of the arms of tendons first ... last - 1: cosine and sine of the major one, `lean`,
-    and 1
-    / sigma^2 of both.
+    """Principal axes of the arms of tendons first ... last - 1: cosine and sine of the major one, `lean`, and
+    1 / sigma^2 of both.
 
     They diagonalise the 2 x 2 normal matrix, whose own smaller eigenvalue would drown in rounding where the
     tendons are nearly in one plane. The columns along the axes keep it: `lean` times the major one is what
@@ -245,8 +241,7 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWorksp
             p, q = _along(axes, offset[t, 0], offset[t, 1])
             tension[t] += a * p + b * q
     # A tendon that can go slack starts taut: from there Newton finds which ones let go; from slack it would
-    # not
-    # see them.
+    # not see them.
     taut = 0.01 * params.tension_scale[pick(i, len(params.tension_scale))]
     for t in range(n_tendons):
         if params.unilateral[pick(i, len(params.unilateral)), t]:

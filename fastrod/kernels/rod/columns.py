@@ -3,8 +3,7 @@ unknown.
 
 A column is (phi, dm, dr): the rotation as a vector in the material frame (dR = R [phi]x), the change of the
 total moment in the material frame, and the change of position in the world frame. The steps below
-differentiate
-`shape` term by term, so a column is the derivative of the computed shape, not only of the rod.
+differentiate `shape` term by term, so a column is the derivative of the computed shape, not only of the rod.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ def _node_before(
     lane: int, i: int, s: float, layout: Layout, shape: RodShape, rod: RodLanes
 ) -> tuple[int, float]:
     """Put the node before arclength s of robot i, and the step from there to s, into a lane; its number, and
-    the
-    fraction of the whole step."""
+    the fraction of the whole step."""
     n_points, node = shape.arclength.shape[1], rod.node
     past = int(np.searchsorted(shape.arclength[i], s * (1.0 + 1e-13), side="right"))
     at = min(max(past - 1, 0), n_points - 2)

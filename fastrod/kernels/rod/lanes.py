@@ -1,8 +1,7 @@
 """Numbers of LANES robots side by side, by name.
 
 A buffer is one-dimensional, field f of lane w at f * LANES + w; the offsets that name fields stand where a
-buffer's
-meaning does. A `LaneMatrix` holds a matrix for each lane.
+buffer's meaning does. A `LaneMatrix` holds a matrix for each lane.
 """
 
 from __future__ import annotations

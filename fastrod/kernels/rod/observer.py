@@ -5,8 +5,7 @@
 The rows of Gamma are taken one after the other, as a Kalman filter takes measurements with independent noise:
 the same G and P to rounding, with divisions by a number in place of a matrix, and sound where Gamma has more
 rows than rank (four tendons on two unknowns in paper mode) or a nearly singular direction (tendons that
-hardly
-stretch).
+hardly stretch).
 
 Vectors over unknowns are padded with zeros to a multiple of BLOCK entries, so that one loop over lanes does
 BLOCK multiply-adds.
