@@ -319,16 +319,17 @@ class Simulator(RobotBatch):
         rods = self._in_motion("momentum")
         return rods.momentum(self._acting(self._last("momentum")[1]), self._warm)
 
-    def apparent_stiffness(self) -> Floats:
+    def apparent_stiffness(self, *, mean: bool = False) -> Floats:
         """(n_robots, 6, 6) by how much force and moment about the base point, which the rod exerts on its
         base at the end of the last step, fall per displacement [m] and rotation [rad] of the base there,
         world: H_bb - H_bq H_qq^-1 H_qb, inertia and all, and half the moment's own rotation, by which it is
         not symmetric. It is that of the shape before the last Newton step: to rounding with more `passes`.
+        With `mean` of `state.mean_wrench`, where inertia is all that resists: its force over the step.
         Raises `InputError` but after a step with `inverse_inertia`; nan for robots that took none."""
         state, _ = self._last("apparent_stiffness")
         if not self.dynamics:
             raise InputError("apparent_stiffness is of a step with inverse_inertia; give it to step.")
-        return self._modal("apparent_stiffness").apparent_stiffness(state)
+        return self._modal("apparent_stiffness").apparent_stiffness(state, mean)
 
     def frequencies(self, count: int = 3) -> Floats:
         """(n_robots, count) lowest natural frequencies [Hz] of small motions about the last state's shape,

@@ -130,24 +130,14 @@ class BulletArm:
 
         Without `q_dot` the next step ends at q where limits and effort allow, and later ones stay there. With
         it, q is where the joints should be now and `q_dot` how fast they go: the next step ends at q + dt
-        q_dot; give both anew before each step. Raises
-        `InputError`.
+        q_dot; give both anew before each step. Raises `InputError`.
         """
         to = self._inside(q, "q").tolist()
         rate = [0.0] * self.n_joints if q_dot is None else self._checked(q_dot, "q_dot").tolist()
         command, mode = self.bullet.setJointMotorControl2, self.bullet.POSITION_CONTROL
         for joint, p, v, (effort, fastest) in zip(self._joint, to, rate, self._motor, strict=True):
-            command(
-                self.body,
-                joint,
-                mode,
-                targetPosition=p,
-                targetVelocity=v,
-                force=effort,
-                positionGain=_GAIN,
-                velocityGain=_GAIN,
-                maxVelocity=fastest,
-            )
+            # position, velocity, force, the gains of both, largest velocity
+            command(self.body, joint, mode, p, v, effort, _GAIN, _GAIN, fastest)
 
     def freeze(self) -> None:
         """Hold all joints where they are."""
@@ -187,8 +177,7 @@ class BulletArm:
         orientation = f" and {np.linalg.norm(off[3:]):.3g} rad" if rows == 6 else ""
         raise HostError(
             "no joint positions within the limits were found near q0 for the target "
-            f"{np.round(to, 4).tolist()}; the best is "
-            f"{np.linalg.norm(off[:3]):.3g} m{orientation} off."
+            f"{np.round(to, 4).tolist()}; the best is {np.linalg.norm(off[:3]):.3g} m{orientation} off."
         )
 
     def _descend(self, goal: Floats, rows: int, q: Floats) -> tuple[Floats, Floats]:
@@ -339,16 +328,8 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
             f"body {body} has no joint that moves between its base and link {tip}; an arm needs one."
         )
     base = np.asarray(np.linalg.inv(com[0]), float)
-    return _Chain(
-        joint,
-        np.array(slides),
-        np.array(axes),
-        np.array(constant),
-        np.array(sine),
-        np.array(cosine),
-        base,
-        fixed,
-    )
+    arrays = map(np.array, (slides, axes, constant, sine, cosine))
+    return _Chain._make([joint, *arrays, base, fixed])
 
 
 def _matrix(position: Sequence[float], xyzw: Sequence[float]) -> Floats:

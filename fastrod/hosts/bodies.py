@@ -37,11 +37,8 @@ class RodBodies:
     ) -> None:
         """`length` of the backbone, split evenly, or of each capsule [m]; `radius` one, or one for each
         capsule [m]; colours RGBA. Raises `HostError`."""
-        if (
-            n_capsules < 1
-            or not np.all(np.asarray(length) > 0.0)
-            or np.shape(length) not in ((), (n_capsules,))
-        ):
+        fits = np.shape(length) in ((), (n_capsules,)) and np.all(np.asarray(length) > 0.0)
+        if n_capsules < 1 or not fits:
             raise HostError(
                 f"{n_capsules} capsules for {length} m; give at least one, and a positive length, of the "
                 "whole or one for each."
@@ -50,9 +47,8 @@ class RodBodies:
         radii = np.broadcast_to(np.asarray(radius, float), n_capsules)
         if not (radii > 0.0).all():
             raise HostError(f"radius is {radius!r} m; it must be positive.")
-        lengths = np.broadcast_to(
-            np.asarray(length, float) / (n_capsules if np.ndim(length) == 0 else 1), n_capsules
-        ).tolist()
+        each = np.asarray(length, float) / (n_capsules if np.ndim(length) == 0 else 1)
+        lengths = np.broadcast_to(each, n_capsules).tolist()
         self.ids: list[int] = []
         """Body of each capsule, base first."""
         for i, (r, own) in enumerate(zip(radii.tolist(), lengths, strict=True)):
@@ -61,10 +57,8 @@ class RodBodies:
             visual = b.createVisualShape(b.GEOM_CAPSULE, radius=r, length=own, rgbaColor=list(rgba))
             self.ids.append(b.createMultiBody(0.0, shape, visual))
             b.changeDynamics(self.ids[-1], -1, lateralFriction=friction, restitution=0.0)
-        self._position, self._quaternion = (
-            np.zeros((n_capsules, 3)),
-            np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1)),
-        )
+        self._position = np.zeros((n_capsules, 3))
+        self._quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1))
 
     def ignore(self, body: int) -> None:
         """Pass through a body, all its links."""
@@ -80,9 +74,7 @@ class RodBodies:
     def stand(self, center: Floats, quaternion: Floats) -> None:
         """Stand at rest with the middles there, (n_capsules, 3) world [m], rotated so, (n_capsules, 4)."""
         self._position, self._quaternion = center, quaternion
-        for own, p, q in zip(
-            self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True
-        ):
+        for own, p, q in zip(self.ids, center.tolist(), to_xyzw(quaternion).tolist(), strict=True):
             self.bullet.resetBasePositionAndOrientation(own, p, q)
             self.bullet.resetBaseVelocity(own, [0.0] * 3, [0.0] * 3)
 

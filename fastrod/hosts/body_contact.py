@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -68,6 +68,7 @@ class BodyContact(ABC):
         self._lost = False  # the rod's forces of the last step were not known
         self._even = False  # the last force was like the one before it
         self._weight, self._past = 1.0, np.zeros(6)  # of the coming force, and of those before it
+        self._then: dict[str, Any] = {}  # all this before the last push
 
     @abstractmethod
     def com(self) -> Motion:
@@ -81,7 +82,7 @@ class BodyContact(ABC):
     @abstractmethod
     def apply(self, wrench: Floats) -> None:
         """Feel (6,) force [N] and moment about the centre of mass [N m], world, during the engine's next
-        step."""
+        step, with what was applied for that before."""
 
     @final
     def mobility(self, pose: Floats | None = None) -> tuple[float, Floats, Floats]:
@@ -122,16 +123,18 @@ class BodyContact(ABC):
         return poses, velocities
 
     @final
-    def push(self, state: State) -> tuple[Floats, Floats]:
-        """Exert the forces of the rod in its contacts with this body.
+    def push(self, state: State, again: bool = False) -> tuple[Floats, Floats]:
+        """Exert the forces of the rod in its contacts with this body; `again` in place of the last ones.
 
         Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,):
         the rod's host takes its opposite.
         """
-        com = self.com().pose[:3]
+        com, wrench, there = self.com().pose[:3], np.zeros(6), self.exerted if again else np.zeros(6)
         if self.mass == 0.0:
             return np.zeros(6), com
-        wrench = np.zeros(6)
+        if again:
+            vars(self).update(self._then)
+        self._then = {name: vars(self)[name] for name in ("_before", "_lost", "_even", "_weight", "_past")}
         if (contacts := state.contacts) is not None:
             for name in self.names:
                 found: Floats = contacts.wrench[0, contacts.names.index(name)]
@@ -153,7 +156,7 @@ class BodyContact(ABC):
         else:
             self._begin_anew(even)
         self._before, self.exerted = wrench, wrench + more
-        self._exert()
+        self._exert(self.exerted - there)
         return more, com
 
     @final
@@ -163,7 +166,7 @@ class BodyContact(ABC):
         half = self._stopping(0.5 * self.exerted) * 0.5 * self.exerted
         self._before, self.exerted, self._lost = 0.5 * self._before, half, True
         self._begin_anew()
-        self._exert()
+        self._exert(half)
 
     @final
     def forget(self) -> None:
@@ -183,6 +186,6 @@ class BodyContact(ABC):
         """Let the body feel the coming force alone; the last one was like the one before it, if `even`."""
         self._even, self._weight, self._past = even, 1.0, np.zeros(6)
 
-    def _exert(self) -> None:
-        if self.exerted.any():
-            self.apply(self.exerted)
+    def _exert(self, wrench: Floats) -> None:
+        if wrench.any():
+            self.apply(wrench)

@@ -5,25 +5,41 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, RobotError, nearest
 from fastrod.hosts.body_contact import BodyContact
-from fastrod.hosts.host import Host
-from fastrod.hosts.rod import INPUTS, Rod
+from fastrod.hosts.host import Freedom, Host, Motion
+from fastrod.hosts.rod import INPUTS, Rod, RodSnapshot
 from fastrod.model.robot import Robot
-from fastrod.rotation import cross
+from fastrod.rotation import cross, displacement
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
+_HELD = 1e-9  # of the mobility of a base: one that goes where it is led
+_ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
+_RODS: weakref.WeakValueDictionary[int, CarriedRod] = weakref.WeakValueDictionary()
+"""All of this process; those on one body find each other here."""
+
+
+class _Begun(NamedTuple):
+    """A step that a rod has begun, until it ends."""
+
+    before: RodSnapshot
+    motion: Motion
+    given: dict[str, Any]
+    """Inputs of the rod for a base that goes where it is led."""
+    factor: float = 1.0
+    """By so much more the rod has resisted than its stiffness says, as where inputs jump."""
 
 
 class CarriedRod(ABC):
@@ -34,14 +50,15 @@ class CarriedRod(ABC):
     body is pushed with it. Any other body meets the rod's capsules. The rod's weight is that in the gravity
     of the world at each step.
 
-    Rod and body move together within the step, at any ratio of their masses, with the rod's inertia. A rod
+    Rod and body move together within the step, at any ratio of their masses, with the rod's inertia; so do
+    several rods on one body, or on one arm: each gives way to those that begin after it. A rod
     without line_density has neither mass nor weight, and a line on stderr says so. Where such a one may touch
     bodies it creeps to its shape with its damping_time, 0.1 s if it states none: without mass and damping it
     would swing with what it pushes for ever. With `dynamics=False` a rod that touches nothing is at rest at
     every step, and its host feels its weight alone: for hosts that motors hold.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
-    each.
+    each. `state` is then what the others have made of it: each rod that begins moves those that have.
     """
 
     body_contacts: Sequence[BodyContact]
@@ -54,6 +71,8 @@ class CarriedRod(ABC):
         """After the last step."""
         self.wrench: Floats = np.zeros(6)
         """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
+        self._begun: _Begun | None = None
+        _RODS[id(self)] = self
 
     @abstractmethod
     def _look(self) -> None:
@@ -121,19 +140,15 @@ class CarriedRod(ABC):
         solved, or where the world's time step has changed.
         """
         self._look()
-        inputs = _checked(inputs)
-        begins = self.state is None
-        motion, given = self._host.motion(), self._scene() | inputs
+        self._release()
+        inputs, self._begun = _checked(inputs), None
+        begins, motion, given = self.state is None, self._host.motion(), self._scene() | inputs
         if self.rod.simulator.dynamics:
-            freedom = self._host.freedom(self.dt)
-            given |= {"inverse_inertia": freedom.inverse_inertia, "free_twist": freedom.twist}
-        state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given)
+            state = self.state = self._with_others(motion, given)
+        else:
+            state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given)
         if state.ok[0]:
-            self.wrench = self.rod.wrench
-            for contact in self.body_contacts:
-                more, point = contact.push(state)
-                self.wrench[:3] -= more[:3]
-                self.wrench[3:] -= more[3:] + cross(point - motion.pose[:3], more[:3])
+            self.wrench = self._push(state, motion.pose[:3])
         else:
             self.wrench = 0.5 * self.wrench
             for contact in self.body_contacts:
@@ -148,6 +163,7 @@ class CarriedRod(ABC):
         if self.state is None:
             raise HostError("end() comes after begin() and the world's step.")
         self._release()
+        self._begun = None
         self._place()
 
     @final
@@ -155,10 +171,82 @@ class CarriedRod(ABC):
         """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put
         somewhere else. The next step settles where the host then is."""
         self.rod.reset()
-        self.state, self.wrench = None, np.zeros(6)
+        self.state, self._begun, self.wrench = None, None, np.zeros(6)
         self._release()
         for contact in self.body_contacts:
             contact.forget()
+
+    def _peers(self) -> list[CarriedRod]:
+        """Rods on bodies that move with this one's."""
+        every = (ref() for ref in _RODS.valuerefs())
+        return [rod for rod in every if rod and rod is not self and self._host.moves_with(rod._host)]
+
+    def _push(self, state: State, point: Floats, again: bool = False) -> Floats:
+        """Push what the rod touches; wrench (6,) on the host, about the base `point` (3,) before the step."""
+        wrench = self.rod.wrench
+        for contact in self.body_contacts:
+            more, at = contact.push(state, again)
+            wrench[:3] -= more[:3]
+            wrench[3:] -= more[3:] + cross(at - point, more[:3])
+        return wrench
+
+    def _with_others(self, motion: Motion, given: dict[str, Any]) -> State:
+        """One step of a rod that moves, and of those on the same body that have begun theirs: these are taken
+        to give way by their stiffness, then do their step again where that has them, until both say the
+        same."""
+        every = [rod for ref in _RODS.valuerefs() if (rod := ref()) and rod._begun and rod is not self]
+        others = [rod for rod in every if self._host.moves_with(rod._host)]
+        before = self.rod.snapshot()
+        for again in reversed(range(_ROUNDS)):
+            freedom = self._host.freedom(self.dt, [(rod._host, rod.wrench) for rod in others])
+            alone, leads = _together(freedom, [rod._stiffness() for rod in others], self.dt)
+            base = {"inverse_inertia": alone.inverse_inertia, "free_twist": alone.twist[:6]}
+            state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given, **base)
+            twists = alone.twist[6:].reshape(-1, 6) + self.dt * leads @ self.rod.wrench
+            agreed = [rod._go_with(twist) for rod, twist in zip(others, twists, strict=True)]
+            if all(agreed) or not again:
+                break
+            self.rod.restore(before)
+        held = {"inverse_inertia": _HELD * freedom.inverse_inertia[:6, :6]}
+        self._begun = _Begun(before, motion, given | held)
+        return state
+
+    def _stiffness(self) -> tuple[Floats, Floats]:
+        """(6, 6) by how much the rod's wrench falls by more motion of its base in the step that it has begun,
+        0 where none is known; and the twist (6,) at which that has gone."""
+        begun, state = self._begun, self.state
+        if begun is None or state is None or not state.ok[0] or not begun.given["inverse_inertia"].any():
+            return np.zeros((6, 6)), np.full(6, np.nan)
+        size, axes = np.linalg.eigh(begun.factor * self.rod.stiffness)
+        resists = (axes * np.maximum(size, 0.0)) @ axes.T  # a rod that buckles helps, which nobody counts on
+        return resists, displacement(begun.motion.pose, self.rod.base) / self.dt
+
+    def _go_with(self, twist: Floats) -> bool:
+        """Do the begun step again, on a base of this `twist` (6,), if that matters: the host feels the
+        difference. Return whether its stiffness had it so. A step that cannot be solved there is as its
+        stiffness has it."""
+        begun, (stiffness, went), before = self._begun, self._stiffness(), self.wrench
+        expected = -self.dt * stiffness @ (twist - went)
+        unit = np.repeat([1.0, 1.0 / self.rod.robot.length], 3)
+        little = _ALIKE * np.abs(unit * before).max()
+        if begun is None or not np.abs(unit * expected).max() > little:
+            return True
+        (pose, velocity), after, more = begun.motion, self.rod.snapshot(), expected
+        self.rod.restore(begun.before)
+        try:
+            state = self.rod.advance(pose, velocity, self.dt, **begun.given, free_twist=twist)
+        except HostError:
+            state = None
+        if state is None or not state.ok[0]:
+            self.rod.restore(after)
+        else:
+            self.state, more = state, self._push(state, pose[:3], again=True) - before
+        self.wrench = before + more
+        self._host.exert(more)
+        self._head_for()
+        factor = float(more @ expected) / max(float(expected @ expected), 1e-300)
+        self._begun = begun._replace(factor=min(max(factor, 0.5), 2.0) * begun.factor)
+        return bool(np.abs(unit * (more - expected)).max() <= little)
 
     def _scene(self) -> dict[str, Any]:
         """Return the rod's inputs from the world: gravity, and the bodies around."""
@@ -174,6 +262,27 @@ class CarriedRod(ABC):
             poses |= p
             velocities |= v
         return world | {"obstacle_pose": poses, "obstacle_velocity": velocities}
+
+
+def _together(freedom: Freedom, others: Sequence[tuple[Floats, Floats]], dt: float) -> tuple[Freedom, Floats]:
+    """`freedom` of the first of its bases, and the twists of the others, where on each of these a rod resists
+    by its stiffness (6, 6) what it does beyond where it went (6,); and by how much a wrench on the first
+    accelerates each (n_others, 6, 6).
+
+    A wrench w moves the others by e = dt^2 (G_o1 w - G_oo K (e - r)) beyond where they are without it, of
+    which they went r already, and the first by dt^2 (G_11 w - G_1o K (e - r)).
+    """
+    every, n = freedom.inverse_inertia, 6 * len(others)
+    resists, ahead = np.zeros((n, n)), np.zeros(n)
+    for k, (stiffness, went) in enumerate(others):
+        here = slice(6 * k, 6 * k + 6)
+        resists[here, here] = stiffness
+        ahead[here] = np.nan_to_num(went - freedom.twist[6:][here])
+    left = np.linalg.inv(np.eye(n) + dt**2 * every[6:, 6:] @ resists)
+    leads, back = left @ every[6:, :6], dt**2 * every[:6, 6:] @ resists
+    twist = freedom.twist + np.concatenate([back @ left @ ahead, ahead - left @ ahead])
+    mobility = every[:6, :6] - back @ leads
+    return Freedom(0.5 * (mobility + mobility.T), twist), leads.reshape(-1, 6, 6)
 
 
 def rod_of(
@@ -253,12 +362,6 @@ def check_bodies(contact_bodies: object) -> None:
             f"contact_bodies is {contact_bodies!r}; give a list of bodies, as "
             f"contact_bodies=[{contact_bodies!r}]."
         )
-
-
-def check_contact(friction: float) -> None:
-    """Raises `InputError` for what is no friction coefficient."""
-    if not isinstance(friction, (int, float, np.floating)) or not 0.0 <= friction < np.inf:
-        raise InputError(f"friction is {friction!r}; it must be a number, zero or positive.")
 
 
 def _checked(inputs: dict[str, Any]) -> dict[str, Any]:

@@ -72,17 +72,9 @@ class Gripper:
         self.fingers = range(n)
         self.length = long
         """Distance from the tip to the fingers' ends [m]."""
+        undamped = dict.fromkeys(("restitution", "linearDamping", "angularDamping", "jointDamping"), 0.0)
         for link in self.links:
-            friction = _FRICTION[link >= 0]
-            b.changeDynamics(
-                self.body,
-                link,
-                lateralFriction=friction,
-                restitution=0.0,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-            )
+            b.changeDynamics(self.body, link, lateralFriction=_FRICTION[link >= 0], **undamped)
         for finger in self.fingers:
             # without it what is held creeps down, 5 mm/s with steps of 10 ms
             b.changeDynamics(self.body, finger, frictionAnchor=1)
@@ -97,9 +89,8 @@ class Gripper:
     @property
     def width(self) -> float:
         """Between the inner faces of the fingers [m]; 0 without fingers."""
-        return float(sum(self.bullet.getJointState(self.body, f)[0] for f in self.fingers)) - 0.5 * _FINGER[
-            0
-        ] * len(self.fingers)
+        middles = [float(self.bullet.getJointState(self.body, f)[0]) for f in self.fingers]
+        return sum(middles) - 0.5 * _FINGER[0] * len(middles)
 
     def open_to(self, fraction: float) -> None:
         """Command the fingers to this fraction of the largest width; they move there at 5 cm/s, as time
@@ -145,13 +136,8 @@ class Gripper:
         b = self.bullet
         own = {self.body, *others}
         known = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
-        points = [
-            p
-            for other in known
-            if other not in own
-            for p in b.getClosestPoints(self.body, other, CONTACT_DISTANCE)
-        ]
-        points = [p for p in points if b.getDynamicsInfo(p[2], p[4])[0] > 0.0]
+        near = (b.getClosestPoints(self.body, other, CONTACT_DISTANCE) for other in known if other not in own)
+        points = [p for found in near for p in found if b.getDynamicsInfo(p[2], p[4])[0] > 0.0]
         if not points:
             return None
         nearest = min(points, key=lambda p: float(p[8]))
@@ -163,18 +149,8 @@ class Gripper:
         )
         back = b.invertTransform(*b.getBasePositionAndOrientation(self.body))
         position, orientation = b.multiplyTransforms(*back, *pose)
-        hold = b.createConstraint(
-            self.body,
-            -1,
-            body,
-            link,
-            b.JOINT_FIXED,
-            [0.0] * 3,
-            position,
-            [0.0] * 3,
-            orientation,
-            [0.0, 0.0, 0.0, 1.0],
-        )
+        frames = [0.0] * 3, position, [0.0] * 3, orientation, [0.0, 0.0, 0.0, 1.0]
+        hold = b.createConstraint(self.body, -1, body, link, b.JOINT_FIXED, *frames)
         b.changeConstraint(hold, maxForce=_SUCTION)
         pairs = [(self.body, own_link) for own_link in self.links]
         pairs += [(other, -1) for other in others if b.getClosestPoints(other, body, self.length)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from fastrod.rotation import displaced
@@ -22,7 +23,8 @@ class Motion(NamedTuple):
 
 
 class Freedom(NamedTuple):
-    """Compliance of a body to a rod within a step; several bodies have an axis before."""
+    """Compliance of a body to a rod within a step; several bodies have an axis before. Of `m` bases that move
+    together both arrays are as long as all of them, one base after the other."""
 
     inverse_inertia: Floats
     """(6, 6) J M^-1 J^T: linear and angular acceleration of the base by force and moment there, world; 0 of
@@ -38,8 +40,13 @@ class Host(Protocol):
     def motion(self) -> Motion:
         """Motion of the rod's base: origin at the first node, z along the rod."""
 
-    def freedom(self, dt: float) -> Freedom:
-        """In the host's next step, of `dt` [s]."""
+    def moves_with(self, other: Host) -> bool:
+        """Whether a force there may move this base within a step, and the other way round."""
+
+    def freedom(self, dt: float, others: Sequence[tuple[Host, Floats]] = ()) -> Freedom:
+        """In the host's next step, of `dt` [s]. `others` that move with it, with the wrench (6,) that each
+        feels in this step already: then of all these bases, this one first."""
 
     def exert(self, wrench: Floats) -> None:
-        """Feel (6,) force [N] and moment about the base point [N m], world, during the host's next step."""
+        """Feel (6,) force [N] and moment about the base point [N m], world, during the host's next step, with
+        what was exerted for that before."""

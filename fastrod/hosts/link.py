@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.host import Freedom, Motion
+from fastrod.hosts.host import Freedom, Host, Motion
 from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -56,51 +57,79 @@ class BulletLink:
         velocity[:3] += cross(velocity[3:], arm)
         return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
 
-    def freedom(self, dt: float) -> Freedom:
+    def moves_with(self, other: Host) -> bool:
+        """See `Host`: links of one body that joints hold to the world, or bases on one link of another."""
+        if not isinstance(other, BulletLink) or other.bullet.number != self.bullet.number:
+            return False
+        return other.body == self.body and other._carrier() == self._carrier()
+
+    def _carrier(self) -> int:
+        """Link with a mass that carries the base; of a body that stands -2 where a joint may move it, else
+        -1."""
+        bullet, link = self.bullet, self.link
+        if bullet.getDynamicsInfo(self.body, -1)[0] == 0.0:
+            return -2 if link >= 0 and self._joints() else -1
+        while link >= 0 and bullet.getDynamicsInfo(self.body, link)[0] == 0.0:
+            link = bullet.getJointInfo(self.body, link)[16]
+        return link
+
+    def _joints(self) -> list[int]:
+        bullet = self.bullet
+        every = range(bullet.getNumJoints(self.body))
+        return [j for j in every if bullet.getJointInfo(self.body, j)[2] != bullet.JOINT_FIXED]
+
+    def freedom(self, dt: float, others: Sequence[tuple[Host, Floats]] = ()) -> Freedom:
         """By the masses alone, whatever motors and contacts hold: a base that gives way more than it does is
         the stable side, and one that is held feels the rod all the same. Of accelerations PyBullet tells
         none. A body that flies has gravity's, joints those by gravity and what their motors exerted in the
         last step; others, and joints without motors, are taken to go on as they move."""
-        bullet, motion = self.bullet, self.motion()
-        point, velocity = motion.pose[:3], motion.velocity.copy()
-        n = bullet.getNumJoints(self.body)
-        joints = [j for j in range(n) if bullet.getJointInfo(self.body, j)[2] != bullet.JOINT_FIXED]
-        heavy = bullet.getDynamicsInfo(self.body, -1)[0] > 0.0
-        if not heavy and joints and self.link >= 0:
-            mobility, gained = self._by_joints(joints)
-            return Freedom(mobility, velocity + dt * gained)
-        if not heavy:
-            return Freedom(np.zeros((6, 6)), velocity)
-        if not joints:
-            velocity[:3] += dt * bullet.gravity
-        return Freedom(self._alone(point), velocity)
+        bullet, carrier = self.bullet, self._carrier()
+        hosts = [self, *(host for host, _ in others if isinstance(host, BulletLink))]
+        motions = [host.motion() for host in hosts]
+        twist = np.concatenate([motion.velocity for motion in motions])
+        if carrier == -2:
+            mobility, gained = self._by_joints(hosts)
+            twist += dt * gained
+        elif bullet.getDynamicsInfo(self.body, -1)[0] == 0.0:
+            mobility = np.zeros((len(twist), len(twist)))
+        else:
+            if not self._joints():
+                twist.reshape(-1, 6)[:, :3] += dt * bullet.gravity
+            mobility = self._alone(carrier, [motion.pose[:3] for motion in motions])
+        for k, (_, wrench) in enumerate(others, 1):
+            twist += dt * mobility[:, 6 * k : 6 * k + 6] @ wrench
+        return Freedom(mobility, twist)
 
-    def _by_joints(self, joints: list[int]) -> tuple[Floats, Floats]:
-        """J M^-1 J^T of a body that stands, and the acceleration (6,) by its motors."""
-        bullet, zeros = self.bullet, [0.0] * len(joints)
+    def _by_joints(self, hosts: Sequence[BulletLink]) -> tuple[Floats, Floats]:
+        """J M^-1 J^T of a body that stands, and the accelerations by its motors."""
+        bullet, joints = self.bullet, self._joints()
+        zeros = [0.0] * len(joints)
         q, rate, _, exerted = map(list, zip(*bullet.getJointStates(self.body, joints), strict=True))
         # its point is in the link's URDF frame, though PyBullet's guide has that of the centre of mass
-        slopes = bullet.calculateJacobian(self.body, self.link, self._position.tolist(), q, zeros, zeros)
-        jacobian, unbalanced = np.concatenate(slopes), np.array(exerted)
+        slopes = [
+            bullet.calculateJacobian(self.body, host.link, host._position.tolist(), q, zeros, zeros)
+            for host in hosts
+        ]
+        jacobian, unbalanced = np.concatenate(slopes, axis=None).reshape(-1, len(joints)), np.array(exerted)
         if unbalanced.any():
             unbalanced -= bullet.calculateInverseDynamics(self.body, q, rate, zeros)
         each = np.column_stack([jacobian.T, unbalanced])
         gained = jacobian @ np.linalg.solve(np.array(bullet.calculateMassMatrix(self.body, q)), each)
-        return gained[:, :6], gained[:, 6]
+        return gained[:, :-1], gained[:, -1]
 
-    def _alone(self, point: Floats) -> Floats:
-        """Mobility of the link, or of the nearest before it that has a mass, as if nothing were joined to
-        it."""
-        bullet, link = self.bullet, self.link
-        while link >= 0 and bullet.getDynamicsInfo(self.body, link)[0] == 0.0:
-            link = bullet.getJointInfo(self.body, link)[16]
+    def _alone(self, link: int, points: Sequence[Floats]) -> Floats:
+        """Mobility at these points (3,) of a link, as if nothing were joined to it."""
+        bullet = self.bullet
         mass, _, inertia = bullet.getDynamicsInfo(self.body, link)[:3]
         pose = com_motion(bullet, self.body, link).pose
         rotation = matrix_from_quaternion(pose[None, 3:])[0]
-        rotary = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
-        across = np.cross(np.eye(3), point - pose[:3])  # [arm]x
-        by_force = np.eye(3) / mass - across @ rotary @ across
-        return np.block([[by_force, -across @ rotary], [rotary @ across, rotary]])
+        by_wrench = np.zeros((6, 6))
+        by_wrench[:3, :3] = np.eye(3) / mass
+        by_wrench[3:, 3:] = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
+        slopes = np.tile(np.eye(6), (len(points), 1, 1))
+        slopes[:, :3, 3:] = [np.cross(point - pose[:3], np.eye(3)) for point in points]  # -[arm]x
+        jacobian = slopes.reshape(-1, 6)
+        return np.asarray(jacobian @ by_wrench @ jacobian.T)
 
     def exert(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the base point [N m], world, during the next stepSimulation."""

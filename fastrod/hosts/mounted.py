@@ -7,12 +7,13 @@ from typing import Any, final
 
 import numpy as np
 
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.body_contact import BodyContact, CollisionShape
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.carried import CarriedRod, check_bodies, check_contact, check_gravity, rod_of
+from fastrod.hosts.carried import CarriedRod, check_bodies, check_gravity, rod_of
 from fastrod.hosts.host import Motion
 from fastrod.hosts.link import BulletLink, com_motion, exert, from_xyzw
 from fastrod.hosts.rod import check_robot
@@ -126,7 +127,7 @@ class MountedRod(CarriedRod):
         self.host, self.bullet = host, host.bullet
         check_robot(robot)
         check_gravity(robot, self._gravity(), "setGravity() in the world")
-        check_contact(friction)
+        check_number("friction", friction, NOT_NEGATIVE)
         check_bodies(contact_bodies)
         links = [_link_of(t) for t in contact_bodies]
         self.body_contacts = [
@@ -142,10 +143,8 @@ class MountedRod(CarriedRod):
             dynamics=dynamics,
         )
         radii = self.rod.radius.tolist()
-        lengths = (
-            np.repeat([segment.length for segment in robot.segments], capsules_per_segment)
-            / capsules_per_segment
-        )
+        each = np.array([segment.length for segment in robot.segments]) / capsules_per_segment
+        lengths = np.repeat(each, capsules_per_segment)
         self.bodies = RodBodies(
             self.bullet, lengths.tolist(), radii, len(radii), color=color, head_color=head_color
         )
@@ -160,8 +159,7 @@ class MountedRod(CarriedRod):
         if self.bullet.dt != self.dt:
             raise HostError(
                 f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for "
-                f"{self.dt:g} s; "
-                "remove() it and mount it anew."
+                f"{self.dt:g} s; remove() it and mount it anew."
             )
 
     def _gravity(self) -> Floats:

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.carried import CarriedRod, check_bodies, check_contact, check_gravity, rod_of
+from fastrod.hosts.carried import CarriedRod, check_bodies, check_gravity, rod_of
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
 from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
 from fastrod.hosts.rod import check_robot
@@ -99,7 +100,7 @@ def add_capsules(
         )
     check_robot(robot)
     check_bodies(contact_bodies)
-    check_contact(friction)
+    check_number("friction", friction, NOT_NEGATIVE)
     if (
         isinstance(capsules_per_segment, bool)
         or not isinstance(capsules_per_segment, (int, np.integer))
@@ -176,7 +177,7 @@ class MujocoRod(CarriedRod):
         super().__init__(host, float(model.opt.timestep))
         self.host, self.model, self.data = host, model, data
         check_gravity(robot, self._gravity(), "set model.opt.gravity")
-        check_contact(friction)
+        check_number("friction", friction, NOT_NEGATIVE)
         check_bodies(contact_bodies)
         others = [body_number(model, other) for other in contact_bodies]
         self.capsule_bodies: list[int] = _capsule_bodies(model, name, robot)
@@ -258,8 +259,7 @@ class MujocoRod(CarriedRod):
         if (min(own, body) << 16) + max(own, body) not in self.model.exclude_signature:
             raise HostError(
                 f"the capsules of {name!r} collide with {self.model.body(body).name!r}, which the rod is to "
-                "touch itself; "
-                "name it in add_capsules(..., contact_bodies=[...]) too."
+                "touch itself; name it in add_capsules(..., contact_bodies=[...]) too."
             )
 
 
@@ -307,8 +307,7 @@ def _check_fit(size: Floats, robot: Robot, name: str) -> None:
         if not np.allclose(is_, be, rtol=1e-6, atol=0.0):
             raise HostError(
                 f"capsule {k} of {name!r} has radius {is_[0]:.4g} m and half length {is_[1]:.4g} m, where "
-                f"this robot has {be[0]:.4g} m "
-                f"and {be[1]:.4g} m; they were added for another robot."
+                f"this robot has {be[0]:.4g} m and {be[1]:.4g} m; they were added for another robot."
             )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError, nearest
-from fastrod.hosts.host import Freedom, Motion
+from fastrod.hosts.host import Freedom, Host, Motion
 from fastrod.hosts.link import mount_pose
 from fastrod.rotation import cross, product, quaternion_from_matrix
 from fastrod.types import Floats
@@ -93,14 +94,13 @@ class Applied:
         self._before: Floats = np.zeros(6)
         self._left: Floats | None = None
 
-    def put(self, wrench: Floats) -> None:
-        """(6,) force [N] and moment about the centre of mass [N m], world, in place of what was put
-        before."""
-        self.take()
+    def add(self, wrench: Floats) -> None:
+        """(6,) force [N] and moment about the centre of mass [N m], world, with what was added before."""
         there = self._data.xfrc_applied[self._body]
-        self._before = there.copy()
+        if self._left is None:
+            self._before = there.copy()
         there += wrench
-        self._left = there.copy()
+        self._left = there.copy() if self._left is None else self._left + wrench
 
     def take(self) -> None:
         """Leave the forces as they were, and what others added since. Forces that somebody has cleared
@@ -158,26 +158,36 @@ class MujocoBody:
         velocity[:3] += cross(velocity[3:], point - self.data.xpos[self.body])
         return velocity
 
-    def freedom(self, dt: float) -> Freedom:
-        """By the accelerations that the model has without the rod: of joints, actuators, contacts."""
+    def moves_with(self, other: Host) -> bool:
+        """See `Host`: bodies of one kinematic tree."""
+        tree = self.model.body_rootid
+        if not isinstance(other, MujocoBody) or other.data is not self.data:
+            return False
+        return bool(tree[other.body] == tree[self.body])
+
+    def freedom(self, dt: float, others: Sequence[tuple[Host, Floats]] = ()) -> Freedom:
+        """By the accelerations that the model has without the rod: of joints, actuators, contacts, and of
+        what others exert already."""
         lib, model, data = mujoco(), self.model, self.data
         lib.mj_forward(model, data)
-        point = self._base()[:3]
-        slopes = np.zeros((4, 3, model.nv))
-        lib.mj_jac(model, data, slopes[0], slopes[1], point, self.body)
-        lib.mj_jacDot(model, data, slopes[2], slopes[3], point, self.body)
-        jacobian, change = slopes.reshape(2, 6, model.nv)
+        hosts = [self, *(host for host, _ in others if isinstance(host, MujocoBody))]
+        slopes = np.zeros((len(hosts), 4, 3, model.nv))
+        for host, slope in zip(hosts, slopes, strict=True):
+            point = host._base()[:3]
+            lib.mj_jac(model, data, slope[0], slope[1], point, host.body)
+            lib.mj_jacDot(model, data, slope[2], slope[3], point, host.body)
+        jacobian, change = (a.reshape(6 * len(hosts), model.nv) for a in (slopes[:, :2], slopes[:, 2:]))
         by_force = np.zeros_like(jacobian)
         if model.nv:
             lib.mj_solveM(model, data, by_force, jacobian)
         gained = jacobian @ data.qacc + 0.5 * change @ data.qvel  # the latter bends the base's path
-        velocity = jacobian @ data.qvel + self._given_velocity(point)
-        return Freedom(jacobian @ by_force.T, velocity + dt * gained)
+        given = np.concatenate([host._given_velocity(host._base()[:3]) for host in hosts])
+        return Freedom(jacobian @ by_force.T, jacobian @ data.qvel + given + dt * gained)
 
     def exert(self, wrench: Floats) -> None:
         """Force and moment about the base point, world, during the next mj_step, and until `release`."""
         arm = self.motion().pose[:3] - self.data.xipos[self.body]
-        self._applied.put(np.concatenate([wrench[:3], wrench[3:] + cross(arm, wrench[:3])]))
+        self._applied.add(np.concatenate([wrench[:3], wrench[3:] + cross(arm, wrench[:3])]))
 
     def release(self) -> None:
         """Feel no more of it."""

@@ -55,9 +55,9 @@ class MujocoBodyContact(BodyContact):
         return separation
 
     def apply(self, wrench: Floats) -> None:
-        """(6,) force [N] and moment about the centre of mass [N m], world, in place of the last; it acts
-        until `release`."""
-        self._applied.put(wrench)
+        """(6,) force [N] and moment about the centre of mass [N m], world, with the last; it acts until
+        `release`."""
+        self._applied.add(wrench)
 
     def release(self) -> None:
         """Feel no more of it."""

@@ -175,6 +175,13 @@ class Rod:
         return self._one(self._wrench)
 
     @property
+    def stiffness(self) -> Floats:
+        """(6, 6) by how much `wrench` falls by displacement [m] and rotation [rad] of a base that gave way in
+        the last step: more of its motion within that step. Raises `InputError` for one that did not."""
+        found = self.simulator.apparent_stiffness(mean=True)
+        return self._one(0.5 * (found + found.swapaxes(1, 2)))
+
+    @property
     def base(self) -> Floats:
         """(7,) pose of the base that the shape belongs to: where the engine's step is expected to end."""
         return self._one(self._base)

@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import HostError, InputError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
@@ -46,11 +47,10 @@ class SoftManiSim:
     worlds a process.
 
     What differs for users of the paper's public code (SoftRobotBasicEnvironment): `gui` is False by default;
-    the second value of
-    `move_robot_ori` holds poses, as the first does; `calc_tip_pos` gives the tip's orientation; actions must
-    be complete (there, zeros are put in front of a short one); in `add_a_cube` the orientation comes second,
-    as in table 8 (the code has size there); suction releases; fingers hold; images are RGB with depth in
-    metres.
+    the second value of `move_robot_ori` holds poses, as the first does; `calc_tip_pos` gives the tip's
+    orientation; actions must be complete (there, zeros are put in front of a short one); in `add_a_cube` the
+    orientation comes second, as in table 8 (the code has size there); suction releases; fingers hold; images
+    are RGB with depth in metres.
 
     Source: Kasaei, Kasaei and Khadem, SoftManiSim, CoRL 2024, table 8.
     """
@@ -80,18 +80,10 @@ class SoftManiSim:
         for a head without fingers. `max_speed` of any point of the robot [m/s]: `move_robot_ori` spreads
         faster motions over several steps. Raises `HostError`, `InputError`.
         """
-        for name, value, least in (
-            ("number_of_sphere", number_of_sphere, 2),
-            ("number_of_segment", number_of_segment, 1),
-        ):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise InputError(f"{name} is {value!r}; it must be a whole number, at least {least}.")
-        for name, size, unit in (
-            ("body_sphere_radius", body_sphere_radius, "m"),
-            ("max_speed", max_speed, "m/s"),
-        ):
-            if not isinstance(size, (int, float, np.number)) or not 0.0 < size < math.inf:
-                raise InputError(f"{name} is {size!r} {unit}; it must be positive and finite.")
+        check_number("number_of_sphere", number_of_sphere, Bound(least=2), whole=True)
+        check_number("number_of_segment", number_of_segment, Bound(least=1), whole=True)
+        check_number("body_sphere_radius", body_sphere_radius, Bound(above=0.0, unit="m"))
+        check_number("max_speed", max_speed, Bound(above=0.0, unit="m/s"))
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(
                 f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype')."
@@ -114,10 +106,8 @@ class SoftManiSim:
         """Position and target of that camera, world; set another to change it."""
         self.in_hand_camera = HostCamera(near=0.005, far=3.0)
         """Camera of `in_hand_camera_capture_image`."""
-        self._colors = (
-            numbers("body_color", body_color, 4).tolist(),
-            numbers("head_color", head_color, 4).tolist(),
-        )
+        given = {"body_color": body_color, "head_color": head_color}
+        self._colors = [numbers(name, color, 4).tolist() for name, color in given.items()]
         self._radius, self._max_width, self._max_speed = body_sphere_radius, max_grasp_width, max_speed
         self._bodies: RodBodies | None = None
         self._marker: int | None = None
@@ -190,8 +180,7 @@ class SoftManiSim:
 
     def wait(self, sec: float) -> None:
         """Advance the world by `sec` [s], at least one step, with the robot at rest. Raises `InputError`."""
-        if not isinstance(sec, (int, float, np.number)) or not 0.0 <= sec < math.inf:
-            raise InputError(f"sec is {sec!r}; it must be a time in seconds, zero or positive.")
+        check_number("sec", sec, Bound(least=0.0, unit="s"))
         for _ in range(max(1, round(sec / self.bullet.dt))):
             self._step()
 
@@ -260,8 +249,7 @@ class SoftManiSim:
         b, half = self.bullet, 0.5 * numbers("size", size, 3)
         if not (half > 0.0).all():
             raise InputError(f"size is {size!r} m; three edge lengths must be positive.")
-        if not isinstance(mass, (int, float, np.number)) or not 0.0 <= mass < math.inf:
-            raise InputError(f"mass is {mass!r} kg; it must be zero or positive.")
+        check_number("mass", mass, Bound(least=0.0, unit="kg"))
         position = numbers("pos", pos, 3).tolist()
         if np.size(ori) == 3:
             raise InputError(
@@ -360,11 +348,8 @@ class SoftManiSim:
 
     def _largest_displacement(self, a: PaperShape, b: PaperShape) -> float:
         """The farthest that any point of the robot moves between two shapes [m]."""
-        corners = np.array([[x, y, self._gripper.length] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [
-            self._max_width,
-            0.02,
-            1.0,
-        ]
+        x, y = 0.5 * self._max_width, 0.01
+        corners = np.array([[a, b, self._gripper.length] for a in (-x, x) for b in (-y, y)])
         gripper = [shape.world[-1, :3] + corners @ shape.rotation[-1].T for shape in (a, b)]
         displacements = np.concatenate([b.world[:, :3] - a.world[:, :3], gripper[1] - gripper[0]])
         return float(np.linalg.norm(displacements, axis=1).max())

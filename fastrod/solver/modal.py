@@ -191,6 +191,14 @@ def no_hosts() -> ModalHost:
     return ModalHost(np.zeros((0, 6, 6)), np.zeros((0, 6)), np.zeros((0, 6)), np.zeros((0, 6, 6)))
 
 
+def mean_by_end(how: Step) -> float:
+    """Mean of the acceleration over a step, by that at its end: kappa of `kernels.rod.modal.host`."""
+    if how.scheme != GENERALIZED_ALPHA:
+        return 1.0 if how.scheme == BDF1 else 2.0 / 3.0
+    mass, force = (2.0 * how.rho - 1.0) / (how.rho + 1.0), how.rho / (how.rho + 1.0)
+    return (0.5 + force - mass) * (1.0 - force) / (1.0 - mass)
+
+
 def hosts_of(inverse_inertia: Floats, length: float) -> ModalHost:
     """Bodies that carry the bases, of inverse inertias (n_robots, 6, 6) about the base point, world; `length`
     [m] weighs turns against displacements."""

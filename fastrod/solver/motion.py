@@ -15,7 +15,7 @@ from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.solver.boundary import new_shape
 from fastrod.solver.inputs import Inputs, arclengths
-from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, no_hosts
+from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, mean_by_end, no_hosts
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
@@ -93,6 +93,7 @@ class ModalRods:
         self._acting: Acting | None = None
         self._errors: Floats | None = None  # of the last step, where they are asked for
         self._host: ModalHost | None = None  # of the last step, where bodies gave way
+        self._mean = np.ones(n_robots)  # of the last step's acceleration at its end in its mean
 
     def accept(self, given: Inputs, how: How | None) -> None:
         """Take the time step and its Newton steps, and the bodies that carry the bases. Raises
@@ -108,6 +109,7 @@ class ModalRods:
         host = None if how.inverse_inertia is None else self._freed(how.inverse_inertia, errors is not None)
         self._errors, self._host = errors, host
         self.stepper.time = self.stepper.time._replace(passes=int(passes), dt=how.dt)
+        self._mean[:] = mean_by_end(self.stepper.time)
 
     def _freed(self, inverse_inertia: ArrayLike, estimates: bool) -> ModalHost:
         """Bodies of this inverse inertia that carry the bases in the next step."""
@@ -261,13 +263,13 @@ class ModalRods:
         mass = self.modal.derive(np.flatnonzero(warm), acting.ports, wanted=("number",)).inertia
         return self.modal.momentum(mass)
 
-    def apparent_stiffness(self, state: State) -> Floats:
+    def apparent_stiffness(self, state: State, mean: bool) -> Floats:
         """(n_robots, 6, 6) as `Simulator.apparent_stiffness`."""
         if self._host is None:
             raise InputError("apparent_stiffness is of a step with inverse_inertia; give it to step.")
         stiffness = self._host.stiffness.copy()
         stiffness[:, 3:, 3:] += 0.5 * np.cross(np.eye(3), state.base_wrench[:, None, 3:])
-        return stiffness
+        return self._mean[:, None, None] * stiffness if mean else stiffness
 
     def frequencies(self, count: object, acting: Acting, warm: Flags) -> Floats:
         """(n_robots, count) as `Simulator.frequencies`."""

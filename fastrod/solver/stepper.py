@@ -115,7 +115,7 @@ class TimeStepper:
         """(n_rows,) who moved on by dt in n steps, before the first of which inputs may `jump`; the others
         are as they were."""
         modal, scheme = self.modal, self.time.scheme
-        start = _rows_of(modal.motion, rows)
+        start = copied(modal.motion)
         # BDF2 would need a step of the same length before
         one = GENERALIZED_ALPHA if scheme == BDF2 else scheme
         how, ok = self.time._replace(scheme=one, dt=self.time.dt / n), np.ones(len(rows), bool)
@@ -141,10 +141,9 @@ class TimeStepper:
         modal.host = host
         if len(mean):
             host.wrench[rows[ok]], host.moved[rows[ok]] = mean[rows[ok]], aside[rows[ok]]
-        for name, array, then in zip(ModalMotion._fields, modal.motion, start, strict=True):
-            array[rows[~ok]] = then[~ok]
-            if scheme != GENERALIZED_ALPHA and name.endswith("_other"):
-                array[rows[ok]] = getattr(start, name.removesuffix("_other"))[ok]
+        put(modal.motion, start, rows[~ok])
+        if scheme != GENERALIZED_ALPHA:
+            came_from(modal.motion, start, rows[ok])
         return ok
 
     def errors(
@@ -161,9 +160,9 @@ class TimeStepper:
         `rows`. `found` is room for a shape."""
         motion, scheme, answer = self.modal.motion, self.time.scheme, np.full(len(tip), np.nan)
         ended = copied(motion)
-        _put(motion, start, rows)
+        put(motion, start, rows)
         ok = self._advance_in(2, rows, inputs, np.ones_like(jump) if scheme == BDF2 else jump, found)
-        _put(motion, ended, rows)
+        put(motion, ended, rows)
         apart = np.linalg.norm(tip[rows] - found.shape.tip_position[rows], axis=1)
         # two halves leave half the error of the first order, a quarter of that of the second
         left = {BDF1: 0.5, GENERALIZED_ALPHA: 0.25}.get(scheme, 0.0)
@@ -202,6 +201,13 @@ def _rows_of(motion: ModalMotion, rows: Ints) -> ModalMotion:
     return ModalMotion(*(a[rows] for a in motion))
 
 
-def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
+def put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
+    """Give these robots the motion that they had then."""
     for array, old in zip(motion, then, strict=True):
         array[rows] = old[rows]
+
+
+def came_from(motion: ModalMotion, start: ModalMotion, rows: Ints) -> None:
+    """BDF2 is to go on from where the whole step began, which these robots took in shorter ones."""
+    motion.q_other[rows], motion.place_other[rows] = start.q[rows], start.place[rows]
+    motion.velocity_other[rows] = start.velocity[rows]

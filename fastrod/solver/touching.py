@@ -9,7 +9,7 @@ that are held up after each; rods that never move have a mass for them that is n
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
 from fastrod.kernels.press_batch import end_some, point_forces, press_some, renew_some, violations
-from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA, ModalMotion
+from fastrod.kernels.rod.modal.motion import BDF1, BDF2, GENERALIZED_ALPHA
 from fastrod.model.robot import Robot
 from fastrod.rotation import displaced
 from fastrod.solver.inputs import Inputs
@@ -36,7 +36,7 @@ from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.recovery import FOLDS, tendon_bend
 from fastrod.solver.settle import unloaded
-from fastrod.solver.stepper import PassShapes, copied
+from fastrod.solver.stepper import PassShapes, came_from, copied, put
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 # passes at most; those in which contacts follow the places where the gap is least, and at most where each
@@ -131,7 +131,7 @@ class TouchingRods(ModalRods):
                 self._passes[free] = np.abs(self.modal.iterations[free])
                 pressed |= engine.overlap(free[ok[free]], found.shape)
             some = warm[pressed[warm]]
-            _put(self.modal.motion, start, some)
+            put(self.modal.motion, start, some)
             ok[some] = self._advance_pressed(some, acting, inputs, (0.0, 1.0), found)[some]
         self.modal.host = no_hosts()
         engine.accept(rows[ok[rows]], found.shape)
@@ -167,8 +167,7 @@ class TouchingRods(ModalRods):
             if k < 0 and contacts.used[i]:
                 k, s = contacts.contact[i, 0][["obstacle", "arclength"]]
             where = f" with {names[k]!r} at arclength {s:.3g} m" if 0 <= k < len(names) else ""
-            inside = f"would be {self._deep[i]:.2g} m inside"
-            what = inside if self._deep[i] > _INSIDE else "finds no balance"
+            what = f"would be {self._deep[i]:.2g} m inside" if self._deep[i] > _INSIDE else "finds no balance"
             said = f"contact{where}: in {4**_DIVISIONS} parts of the step, too, the rod {what}"
             what = "come there in smaller steps"
             if folds[i] > FOLDS:
@@ -206,7 +205,7 @@ class TouchingRods(ModalRods):
         ok[free] = self.stepper.rest(free, rows[cold[rows]], acting.ports, found, min(tolerance, AT_REST))
         meets = engine.whole_worlds(pressed | (self._mask(free) & ~ok))
         meets |= engine.overlap(free[~meets[free]], found.shape)
-        _put(motion, start, some := rows[meets[rows]])
+        put(motion, start, some := rows[meets[rows]])
         ok[some] = self.rest_pressed(some, cold, acting, last, found, tolerance)[some]
         return ok
 
@@ -333,16 +332,14 @@ class TouchingRods(ModalRods):
         if len(aside):
             host.moved[left], host.wrench[left] = aside[left], mean[left]
         back = lost[~ok[lost]]
-        _put(motion, start, back)
+        put(motion, start, back)
         self._go_back(back, contacts)
         if engine.yielded is not None and kept is not None:
             engine.yielded[:, back] = kept[:, back]
         if before is not None and engine.before is not None:
             for array, then in zip(engine.before, before, strict=True):
                 array[lost] = then[lost]
-        for name, array in zip(ModalMotion._fields, motion, strict=True):
-            if name.endswith("_other"):  # BDF2 goes on from where the whole step began
-                array[left] = getattr(start, name.removesuffix("_other"))[left]
+        came_from(motion, start, left)
         return ok
 
     def _go_back(self, rows: Ints, then: ContactSet) -> None:
@@ -421,16 +418,11 @@ class TouchingRods(ModalRods):
                     search_worlds(engine.in_worlds(some), search._replace(closer=closer), True)
             modal.place_points(self._points(left, acting), ports.extension)
             d = modal.derive(left, ports, q, wanted=("hessian", "point"), step=(motion, how, np.zeros(n)))
+            self._note_stiffness(left, d.hessian, n_q, how)
             # a body gives way within one step of its engine, however long those to a rest are
             yielding = (how.dt / self.stepper.time.dt) ** 2 if moves else 1.0
-            model = (
-                d.hessian,
-                d.gradient,
-                d.point_change,
-                d.point_rotation,
-                acting.points[0].shape[1],
-                yielding,
-            )
+            slopes = d.hessian, d.gradient, d.point_change, d.point_rotation
+            model = (*slopes, acting.points[0].shape[1], yielding)
             renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
             renew[size < (0.0 if moves else _NEAR)] = _EXACTLY
             self._press(left, (*seen, *model, renew, still, step, changed))
@@ -474,6 +466,17 @@ class TouchingRods(ModalRods):
         modal.place_points(acting.points, ports.extension)
         return ok
 
+    def _note_stiffness(self, rows: Ints, hessian: Floats, n_q: int, how: Step) -> None:
+        """By how much what these rods exert falls by the motion of a base that gives way: of `hessian`
+        (n_robots, n_q + 6, n_q + 6), contacts held, modes eliminated, less the inertia of the base itself."""
+        host = self.modal.host
+        if not len(host.inertia):
+            return
+        modes, base = hessian[rows, :n_q], hessian[rows, n_q:, n_q:]
+        eliminated = modes[:, :, n_q:].swapaxes(1, 2) @ np.linalg.solve(modes[:, :, :n_q], modes[:, :, n_q:])
+        host.stiffness[rows] = base - eliminated - host.inertia[rows] / how.dt**2
+        self._mean[rows] = 1.0  # BDF1
+
     def _knotted(self, rows: Ints, shape: RodShape) -> Flags:
         """(n,) whose curvature its nodes no longer resolve: Newton's method has left for nowhere, where sums
         overflow and steps look small."""
@@ -487,23 +490,20 @@ class TouchingRods(ModalRods):
                 least = found[int(np.argmin(found["gap"][: abs(n)]))]
                 self._nearest[i] = int(least["obstacle"]), float(least["arclength"])
 
+    def _on_threads(self, n: int, work: Callable[[int, int, int], None]) -> None:
+        """Do `work` of so many pieces on so many threads."""
+        in_threads(n, -(-n // self.engine.thread_count(n)), work)
+
     def _renew(self, rows: Ints, seen: Any, near: Any, n_found: Ints, still: Flags) -> None:
-        """`renew_some` on so many threads."""
-
-        def renew(_: int, first: int, last: int) -> None:
-            renew_some(rows[first:last], *(*seen, near[first:last], n_found[first:last], still))
-
-        in_threads(len(rows), -(-len(rows) // self.engine.thread_count(len(rows))), renew)
+        """`renew_some` on threads."""
+        self._on_threads(
+            len(rows), lambda _, a, b: renew_some(rows[a:b], *(*seen, near[a:b], n_found[a:b], still))
+        )
 
     def _press(self, rows: Ints, given: Any) -> None:
-        """`press_some` on so many threads."""
+        """`press_some` on threads."""
         start, robot = self.engine.in_worlds(rows)[:2]
-        n = len(start) - 1
-
-        def press(_: int, first: int, last: int) -> None:
-            press_some(start[first : last + 1], robot, *given)
-
-        in_threads(n, -(-n // self.engine.thread_count(n)), press)
+        self._on_threads(len(start) - 1, lambda _, a, b: press_some(start[a : b + 1], robot, *given))
 
     def _seen(
         self, rows: Ints, ports: Ports, how: Step, q: Floats, found: PassShapes, frames: Any
@@ -536,8 +536,3 @@ class TouchingRods(ModalRods):
         force, moment = np.zeros((2, *at.shape, 3))
         point_forces(arclength, given, contacts, at, force, moment)
         return at, force, moment
-
-
-def _put(motion: ModalMotion, then: ModalMotion, rows: Ints) -> None:
-    for array, old in zip(motion, then, strict=True):
-        array[rows] = old[rows]

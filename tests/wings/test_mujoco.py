@@ -256,8 +256,8 @@ CAPSULE_INPUT = {
         color=(1, 2)
     ),
     r"^head_color is 'red'; give red, green, blue and opacity": capsules(head_color="red"),
-    r"^friction is nan; it must be a number, zero or positive\.$": capsules(friction=np.nan),
-    r"^friction is -1; it must be a number, zero or positive\.$": capsules(friction=-1),
+    r"^friction is nan; it must be a number, zero or positive and finite\.$": capsules(friction=np.nan),
+    r"^friction is -1; it must be a number, zero or positive and finite\.$": capsules(friction=-1),
 }
 CAPSULE_HOSTS = {
     r"^contact_bodies is 'ball'; give a list of bodies, as contact_bodies=\['ball'\]\.$": capsules(

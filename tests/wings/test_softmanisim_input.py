@@ -47,11 +47,11 @@ BAD_INPUT = {
     "three edge lengths must be positive": cube(size=[0.1, 0.1, 0]),
     "ori is .* The size comes third": cube([0.3, 0.03, 0.03]),
     "ori is .* norm 0; it must be 1": cube(ori=[0, 0, 0, 0]),
-    "mass is -1 kg; it must be zero or positive": cube(mass=-1),
-    "sec is -1.0; it must be a time": lambda s: s.wait(-1.0),
-    "sec is nan; it must be a time": lambda s: s.wait(math.nan),
+    "mass is -1 kg; it must be a number, zero or positive": cube(mass=-1),
+    "sec is -1.0 s; it must be a number, zero or positive": lambda s: s.wait(-1.0),
+    "sec is nan s; it must be a number, zero or positive": lambda s: s.wait(math.nan),
     "number_of_sphere is 1; it must be a whole number, at least 2": made(number_of_sphere=1),
-    "body_sphere_radius is 0.0 m; it must be positive": made(body_sphere_radius=0.0),
+    "body_sphere_radius is 0.0 m; it must be a number, positive": made(body_sphere_radius=0.0),
 }
 NOT_THERE = {
     "no body 999": lambda s: s.is_robot_in_contact(999),

@@ -1,0 +1,182 @@
+"""Several rods on one body, or on one arm: they move together, whatever the masses."""
+
+import mujoco
+import numpy as np
+import pytest
+from bullets import cube, empty_world, kuka, soft_robot
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from fastrod.hosts import BulletLink, MountedRod, MujocoBody, MujocoRod, add_capsules
+
+TWIST = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0])
+ROD = soft_robot(line_density=0.2)  # 0.04 kg
+HOME = np.array(ROD.rest_tendon_length)
+
+
+def around(n):
+    """(n, 4) quaternions w x y z of rods that stand out evenly in the x-y plane."""
+    angles = 2.0 * np.pi * np.arange(n) / n
+    axes = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    turned = (Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0] for axis in axes)
+    return [r.as_quat(scalar_first=True).tolist() for r in turned]
+
+
+class Hand:
+    """A free box that carries rods in PyBullet or in MuJoCo."""
+
+    def __init__(self, engine, n, mass, dt):
+        self.dt, self.mass, half = dt, mass, [0.03] * 3
+        inertia = [6e-4 * mass] * 3
+        if engine == "pybullet":
+            self.world = world = empty_world(dt)
+            self.body = world.createMultiBody(mass, world.createCollisionShape(3, halfExtents=half))
+            still = {"linearDamping": 0.0, "angularDamping": 0.0}
+            world.changeDynamics(self.body, -1, localInertiaDiagonal=inertia, **still)
+            links = (BulletLink(world, self.body, quaternion=q) for q in around(n))
+            self.rods = [MountedRod(ROD, link) for link in links]
+        else:
+            spec = mujoco.MjSpec()
+            spec.option.timestep, spec.option.gravity = dt, [0.0] * 3
+            body = spec.worldbody.add_body(name="hand", mass=mass, inertia=inertia, explicitinertial=True)
+            body.add_freejoint()
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half)
+            for k in range(n):
+                add_capsules(spec, ROD, "hand", name=f"rod {k}")
+            self.model = spec.compile()
+            self.data = mujoco.MjData(self.model)
+            on = (self.model, self.data, "hand")
+            self.rods = [MujocoRod(ROD, *on, quaternion=q, name=f"rod {k}") for k, q in enumerate(around(n))]
+        self.engine = engine
+        for rod in self.rods:
+            rod.settle()
+        if engine == "pybullet":
+            self.world.resetBaseVelocity(self.body, TWIST[:3].tolist(), TWIST[3:].tolist())
+        else:
+            self.data.qvel[:] = TWIST
+
+    def step(self, k, order=1):
+        """Tendons pull to and fro, in turn."""
+        pull = 0.004 * np.sin(4.0 * np.pi * k * self.dt) * np.eye(len(HOME))[0]
+        each = list(zip(self.rods, np.resize([-1.0, 1.0], len(self.rods)), strict=True))
+        ok = [rod.begin(tendon_length=HOME + sign * pull).ok[0] for rod, sign in each[::order]]
+        self.world.stepSimulation() if self.engine == "pybullet" else mujoco.mj_step(self.model, self.data)
+        for rod in self.rods:
+            rod.end()
+        return all(ok) and all(rod.state.ok[0] for rod in self.rods)
+
+    @property
+    def velocity(self):
+        if self.engine == "pybullet":
+            return np.concatenate(self.world.getBaseVelocity(self.body))
+        turned = self.data.xmat[self.rods[0].host.body].reshape(3, 3)
+        return np.concatenate([self.data.qvel[:3], turned @ self.data.qvel[3:]])
+
+    @property
+    def momentum(self):
+        rods = sum(rod.simulator.momentum()[0, :3] for rod in self.rods)
+        return self.mass * self.velocity[:3] + rods
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize(("n", "mass"), [(2, 1.0), (2, 0.02), (4, 0.02)])
+@pytest.mark.study(beyond=2)
+def test_they_keep_their_momentum_on_a_hand_of_any_mass(engine, n, mass):
+    hand, momentum, fastest = Hand(engine, n, mass, 0.01), [], 0.0
+    for k in range(100):
+        assert hand.step(k)
+        momentum.append(hand.momentum)
+        fastest = max(fastest, np.abs(hand.velocity).max())
+    assert_allclose(momentum, np.tile(momentum[0], (100, 1)), atol=1e-9)
+    assert_allclose(momentum[0][:2], (mass + 0.04 * n) * TWIST[:2], rtol=1e-3)
+    assert fastest < 10.0
+
+
+@pytest.mark.study
+def test_the_engines_agree():
+    hands = [Hand(engine, 3, 0.05, 0.005) for engine in ("pybullet", "mujoco")]
+    for k in range(60):
+        for hand in hands:
+            assert hand.step(k)
+        assert_allclose(hands[0].velocity, hands[1].velocity, atol=1e-4)
+
+
+@pytest.mark.study
+def test_it_does_not_matter_who_begins():
+    hands, apart = [Hand("pybullet", 2, 0.1, 0.0025) for _ in range(2)], []
+    for k in range(40):
+        for hand, order in zip(hands, (1, -1), strict=True):
+            assert hand.step(k, order)
+        apart.append(np.abs(hands[0].velocity - hands[1].velocity).max())
+    assert max(apart) < 0.01 * np.abs(hands[0].velocity).max()
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_a_wrench_on_one_link_of_an_arm_moves_the_base_on_another(engine):
+    dt, wrench = 1e-3, 50.0 * np.array([1.0, -2.0, 0.5, 0.1, 0.2, -0.3])
+    if engine == "pybullet":
+        world = empty_world(dt)
+        arm, _, _ = kuka(world, 2)
+        one, other = (BulletLink(world, arm, link, position=(0.0, 0.02, 0.05)) for link in (6, 3))
+        away, step = BulletLink(world, world.createMultiBody(1.0, -1, -1, [9.0] * 3)), world.stepSimulation
+    else:
+        links = "".join(
+            f'<body name="{k}" pos="0 0 .2"><joint axis="{int(k % 2)} {int(k % 2 == 0)} 0"/>'
+            '<geom type="capsule" size=".02" fromto="0 0 0 0 0 .2" mass="1"/>'
+            for k in range(4)
+        )
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option timestep="{dt}" gravity="0 0 0"/><worldbody>{links}{"</body>" * 4}'
+            '<body name="away" pos="1 0 0"><freejoint/><geom size=".1" mass="1"/></body></worldbody></mujoco>'
+        )
+        data = mujoco.MjData(model)
+        data.qpos[:4], data.qvel[:4] = [0.3, -0.4, 0.5, 0.2], [0.2, 0.1, -0.3, 0.1]
+        one, other = (MujocoBody(model, data, k, position=(0.0, 0.02, 0.05)) for k in ("3", "1"))
+        away, step = MujocoBody(model, data, "away"), lambda: mujoco.mj_step(model, data)
+    assert one.moves_with(other)
+    assert other.moves_with(one)
+    assert not one.moves_with(away)
+    if engine == "mujoco":
+        other.exert(wrench)
+        expected = one.freedom(dt, [(other, wrench)])
+    else:
+        expected = one.freedom(dt, [(other, wrench)])
+        other.exert(wrench)
+    step()
+    assert_allclose(expected.inverse_inertia, expected.inverse_inertia.T, atol=1e-9)
+    moved = np.concatenate([base.motion().velocity for base in (one, other)])
+    pushed = dt * expected.inverse_inertia[:, 6:] @ wrench
+    assert np.abs(pushed[:6]).max() > 0.01
+    assert_allclose(moved, expected.twist, atol=0.01 * np.abs(pushed[:6]).max())
+
+
+@pytest.mark.parametrize("line_density", [0.0, 0.1])
+@pytest.mark.study
+def test_what_they_grasp_adds_nothing_to_the_momentum_of_their_hand(line_density):
+    robot, mass, dt = soft_robot(line_density=line_density), 0.2, 0.01
+    world, held = empty_world(dt), 0.1
+    hand = world.createMultiBody(mass, world.createCollisionShape(3, halfExtents=[0.05, 0.02, 0.02]))
+    world.changeDynamics(hand, -1, linearDamping=0.0, angularDamping=0.0)
+    thing = cube(world, 0.04, held, [0.0, 0.0, -0.2], 1.0)
+    links = [
+        BulletLink(world, hand, position=(s, 0, -0.02), quaternion=(0, 1, 0, 0)) for s in (-0.045, 0.045)
+    ]
+    rods = [MountedRod(robot, link, contact_bodies=[thing], friction=0.8) for link in links]
+    for rod in rods:
+        rod.settle()
+    home, force, fastest = np.array(robot.rest_tendon_length), 0.0, 0.0
+    for k in range(100):
+        pull = 0.0012 * min(k * dt / 0.5, 1.0) * np.resize([-1.0, 0.0, 1.0, 0.0], len(home))
+        ok = [rod.begin(tendon_length=home - s * pull).ok[0] for rod, s in zip(rods, (-1, 1), strict=True)]
+        world.stepSimulation()
+        for rod in rods:
+            rod.end()
+        both = mass * np.array(world.getBaseVelocity(hand)[0])
+        both += held * np.array(world.getBaseVelocity(thing)[0])
+        both += sum(rod.simulator.momentum()[0, :3] for rod in rods)
+        assert all(ok)
+        assert_allclose(both, 0.0, atol=1e-9)
+        fastest = max(fastest, np.abs(world.getBaseVelocity(thing)[0]).max())
+        force = max(force, min(np.linalg.norm(rod.body_contacts[0].exerted[:3]) for rod in rods))
+    assert force > 0.05
+    assert fastest < 0.05
