@@ -176,11 +176,6 @@ class CarriedRod(ABC):
         for contact in self.body_contacts:
             contact.forget()
 
-    def _peers(self) -> list[CarriedRod]:
-        """Rods on bodies that move with this one's."""
-        every = (ref() for ref in _RODS.valuerefs())
-        return [rod for rod in every if rod and rod is not self and self._host.moves_with(rod._host)]
-
     def _push(self, state: State, point: Floats, again: bool = False) -> Floats:
         """Push what the rod touches; wrench (6,) on the host, about the base `point` (3,) before the step."""
         wrench = self.rod.wrench
@@ -214,10 +209,12 @@ class CarriedRod(ABC):
     def _stiffness(self) -> tuple[Floats, Floats]:
         """(6, 6) by how much the rod's wrench falls by more motion of its base in the step that it has begun,
         0 where none is known; and the twist (6,) at which that has gone."""
-        begun, state = self._begun, self.state
-        if begun is None or state is None or not state.ok[0] or not begun.given["inverse_inertia"].any():
+        begun, state, stiffness = self._begun, self.state, np.full((6, 6), np.nan)
+        if begun is not None and state is not None and state.ok[0] and begun.given["inverse_inertia"].any():
+            stiffness = begun.factor * self.rod.stiffness
+        if begun is None or not np.isfinite(stiffness).all():  # of a step that could not be done again, too
             return np.zeros((6, 6)), np.full(6, np.nan)
-        size, axes = np.linalg.eigh(begun.factor * self.rod.stiffness)
+        size, axes = np.linalg.eigh(stiffness)
         resists = (axes * np.maximum(size, 0.0)) @ axes.T  # a rod that buckles helps, which nobody counts on
         return resists, displacement(begun.motion.pose, self.rod.base) / self.dt
 
