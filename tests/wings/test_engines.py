@@ -194,7 +194,7 @@ def test_rod_that_stays_lost_is_reported(stage, monkeypatch):
 
 @pytest.mark.parametrize("option", [{"friction": -1}, {"friction": float("nan")}])
 def test_contact_options_are_checked(stage, option):
-    with pytest.raises(InputError, match=r"it must be a number, zero or positive\."):
+    with pytest.raises(InputError, match=r"it must be a number, zero or positive and finite\."):
         stage(soft_robot(), **option)
 
 
