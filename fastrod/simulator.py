@@ -324,7 +324,8 @@ class Simulator(RobotBatch):
         base at the end of the last step, fall per displacement [m] and rotation [rad] of the base there,
         world: H_bb - H_bq H_qq^-1 H_qb, inertia and all, and half the moment's own rotation, by which it is
         not symmetric. It is that of the shape before the last Newton step: to rounding with more `passes`.
-        With `mean` of `state.mean_wrench`, where inertia is all that resists: its force over the step.
+        With `mean` it is that of `state.mean_wrench` where nothing but inertia resists: of its force, and of
+        its moment with the rod where it is at the end of the step.
         Raises `InputError` but after a step with `inverse_inertia`; nan for robots that took none."""
         state, _ = self._last("apparent_stiffness")
         if not self.dynamics:

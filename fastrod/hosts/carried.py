@@ -25,7 +25,7 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
-_HELD = 1e-9  # of the mobility of a base: one that goes where it is led
+_HELD = 1e-9  # of the mobility of a base: one whose motion is given
 _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
 _RODS: weakref.WeakValueDictionary[int, CarriedRod] = weakref.WeakValueDictionary()
 """All of this process; those on one body find each other here."""
@@ -37,7 +37,7 @@ class _Begun(NamedTuple):
     before: RodSnapshot
     motion: Motion
     given: dict[str, Any]
-    """Inputs of the rod for a base that goes where it is led."""
+    """Inputs of the rod for a base whose motion is given."""
     factor: float = 1.0
     """By so much more the rod has resisted than its stiffness says, as where inputs jump."""
 
@@ -51,14 +51,14 @@ class CarriedRod(ABC):
     of the world at each step.
 
     Rod and body move together within the step, at any ratio of their masses, with the rod's inertia; so do
-    several rods on one body, or on one arm: each gives way to those that begin after it. A rod
-    without line_density has neither mass nor weight, and a line on stderr says so. Where such a one may touch
-    bodies it creeps to its shape with its damping_time, 0.1 s if it states none: without mass and damping it
-    would swing with what it pushes for ever. With `dynamics=False` a rod that touches nothing is at rest at
-    every step, and its host feels its weight alone: for hosts that motors hold.
+    several rods on one body, or on one arm. A rod without line_density has neither mass nor weight, and a
+    line on stderr says so. Where such a one may touch bodies it creeps to its shape with its damping_time,
+    0.1 s if it states none: without mass and damping it would swing with what it pushes for ever. With
+    `dynamics=False` a rod that touches nothing is at rest at every step, and its host feels its weight alone:
+    for hosts that motors hold.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
-    each. `state` is then what the others have made of it: each rod that begins moves those that have.
+    each. Of several rods on one body, each that begins moves those that have begun: read `state` after `end`.
     """
 
     body_contacts: Sequence[BodyContact]

@@ -61,14 +61,15 @@ class BulletLink:
         """See `Host`: links of one body that joints hold to the world, or bases on one link of another."""
         if not isinstance(other, BulletLink) or other.bullet.number != self.bullet.number:
             return False
-        return other.body == self.body and other._carrier() == self._carrier()
+        carrier = self._carrier() if other.body == self.body else None
+        return carrier is not None and carrier == other._carrier()
 
-    def _carrier(self) -> int:
-        """Link with a mass that carries the base; of a body that stands -2 where a joint may move it, else
-        -1."""
+    def _carrier(self) -> int | None:
+        """Link with a mass that carries the base; of a body that stands -2 where its joints may move the
+        base, else None."""
         bullet, link = self.bullet, self.link
         if bullet.getDynamicsInfo(self.body, -1)[0] == 0.0:
-            return -2 if link >= 0 and self._joints() else -1
+            return -2 if link >= 0 and self._joints() else None
         while link >= 0 and bullet.getDynamicsInfo(self.body, link)[0] == 0.0:
             link = bullet.getJointInfo(self.body, link)[16]
         return link
@@ -90,7 +91,7 @@ class BulletLink:
         if carrier == -2:
             mobility, gained = self._by_joints(hosts)
             twist += dt * gained
-        elif bullet.getDynamicsInfo(self.body, -1)[0] == 0.0:
+        elif carrier is None:
             mobility = np.zeros((len(twist), len(twist)))
         else:
             if not self._joints():

@@ -348,8 +348,8 @@ class SoftManiSim:
 
     def _largest_displacement(self, a: PaperShape, b: PaperShape) -> float:
         """The farthest that any point of the robot moves between two shapes [m]."""
-        x, y = 0.5 * self._max_width, 0.01
-        corners = np.array([[a, b, self._gripper.length] for a in (-x, x) for b in (-y, y)])
+        right, up, long = 0.5 * self._max_width, 0.01, self._gripper.length
+        corners = np.array([[x, y, long] for x in (-right, right) for y in (-up, up)])
         gripper = [shape.world[-1, :3] + corners @ shape.rotation[-1].T for shape in (a, b)]
         displacements = np.concatenate([b.world[:, :3] - a.world[:, :3], gripper[1] - gripper[0]])
         return float(np.linalg.norm(displacements, axis=1).max())

@@ -14,7 +14,7 @@ from pairs import GRAVITY, HOME, FreeBody, falling, heavy
 from rods import rod as small
 from scipy.special import ellipk
 
-from fastrod import Rod, Simulator
+from fastrod import Modal, Rod, Simulator
 from fastrod.errors import InputError
 from fastrod.hosts import BulletLink, MountedRod, MujocoRod, add_capsules
 from fastrod.rotation import displaced
@@ -80,6 +80,33 @@ def test_the_apparent_stiffness_is_the_slope_of_the_wrench(name: str, dt: float)
         found[:, k] = -(8.0 * (far[1] - far[-1]) - (far[2] - far[-2])) / (12.0 * h)
     size = np.sqrt(np.outer(np.diag(found), np.diag(found)))
     assert_allclose(stiffness / size, found / size, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("rho", [0.0, 0.5])
+def test_the_stiffness_of_the_mean_is_the_slope_of_what_the_body_feels(rho: float) -> None:
+    robot = heavy(0.05)
+    sim = Simulator(robot, dt=0.01, solver=Modal(dynamics=True, rho=rho), points_per_segment=10, threads=1)
+    length, held = np.array(robot.rest_tendon_length), 1e-9 * np.diag([2.0] * 3 + [300.0] * 3)
+    sim.settle(length, base_pose=HOME)
+    for k in range(3):
+        sim.step(length - 1e-4 * k * np.eye(len(length))[0], base_pose=HOME)
+    kept = sim.snapshot()
+
+    def wrench(by: Floats) -> Floats:
+        sim.restore(kept)
+        given = {"base_pose": displaced(HOME, by), "inverse_inertia": held}
+        felt = sim.step(length, **given, passes=10).mean_wrench[0].copy()
+        felt[3:] -= np.cross(by[:3], felt[:3])  # about where the base point is at the end
+        return felt
+
+    found = np.array([(wrench(-h) - wrench(h)) / 2e-6 for h in 1e-6 * np.eye(6)]).T
+    wrench(np.zeros(6))
+    stiffness = sim.apparent_stiffness(mean=True)[0]
+    size = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    assert_allclose(stiffness[:3] / size[:3], found[:3] / size[:3], rtol=0.0, atol=1e-6)
+    # the arms of the moments are those at the end of the step
+    assert_allclose(stiffness[3:] / size[3:], found[3:] / size[3:], rtol=0.0, atol=0.02)
 
 
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
