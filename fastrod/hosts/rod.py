@@ -178,6 +178,8 @@ class Rod:
     def stiffness(self) -> Floats:
         """(6, 6) by how much `wrench` falls by displacement [m] and rotation [rad] of a base that gave way in
         the last step: more of its motion within that step. Raises `InputError` for one that did not."""
+        if self.state.mean_wrench is None:
+            raise InputError("stiffness is of a base that gave way; give inverse_inertia to advance().")
         found = self.simulator.apparent_stiffness(mean=True)
         return self._one(0.5 * (found + found.swapaxes(1, 2)))
 

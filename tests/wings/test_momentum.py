@@ -229,3 +229,5 @@ def test_wrong_inverse_inertia_is_a_sentence() -> None:
     rod.advance(HOME, np.zeros(6), 0.01)
     with pytest.raises(InputError, match=r"^apparent_stiffness is of a step with inverse_inertia"):
         rod.simulator.apparent_stiffness()
+    with pytest.raises(InputError, match=r"^stiffness is of a base that gave way; give inverse_inertia to"):
+        _ = rod.stiffness
