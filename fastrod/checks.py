@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from math import inf
 from sys import float_info
@@ -23,10 +23,12 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from fastrod.errors import FastrodError, InputError, nearest, shown
+from fastrod.errors import FastrodError, InputError, nearest, refuse_masked, shown
 
 _Class = TypeVar("_Class")
+_Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +103,34 @@ def check(given: Any, prefix: str | None = None) -> None:
 def check_number(name: str, value: object, bound: Bound = POSITIVE, *, whole: bool = False) -> None:
     """Raise `InputError` unless this is a number within the bound."""
     check_value(name, value, Declared(int if whole else float, (), bound))
+
+
+def checked_array(name: str, value: ArrayLike, shapes: Sequence[tuple[int, ...]], says: str) -> _Array:
+    """A copy of an array of one of these shapes, of what it `says`, finite. Raises `InputError`."""
+    refuse_masked(name, value)
+    wanted = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name} is not an array of numbers; give {wanted}, {says}.") from error
+    if found.shape not in shapes:
+        raise InputError(f"{name} has shape {found.shape}; it must be {wanted}, {says}.")
+    if not np.isfinite(found).all():
+        some = found.ravel()[:14].tolist()
+        raise InputError(f"{name} holds a value that is not finite: {some}; give {says}.")
+    return found
+
+
+def checked_pose(name: str, value: ArrayLike, *rows: int) -> _Array:
+    """(7,), or (n, 7) of one of these many `rows`: position [m] and quaternion w x y z, which is made unit;
+    its norm is 1 to 1e-3. Raises `InputError`."""
+    says = "position [m] and quaternion w x y z"
+    pose = checked_array(name, value, [(7,), *((n, 7) for n in rows)], says)
+    norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    if (beyond := np.abs(norm - 1.0)).max() > 1e-3:
+        worst = norm.ravel()[beyond.argmax()]
+        raise InputError(f"{name} has a quaternion of norm {worst:.6g}; it must be 1, as w x y z.")
+    return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)
 
 
 def check_value(name: str, value: Any, declared: Declared) -> None:

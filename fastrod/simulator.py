@@ -14,7 +14,7 @@ from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.solver import options
 from fastrod.solver.gpu import device as devices
-from fastrod.solver.inputs import Inputs, PointForces, arclengths, mobility, named_inputs, robot_mask
+from fastrod.solver.inputs import Inputs, PointForces, arclengths, free_body, named_inputs, robot_mask
 from fastrod.solver.observer import ObserverSolver
 from fastrod.solver.options import Modal, Observer, SchemeName, SolverName
 from fastrod.solver.protocol import How, Solver
@@ -435,21 +435,26 @@ class Simulator(RobotBatch):
     def set_free(
         self,
         obstacle: str,
-        translation: float,
-        rotation: ArrayLike,
+        mobility: ArrayLike,
         center: ArrayLike,
         body: int | None = None,
+        ahead: ArrayLike = (0.0,) * 6,
     ) -> None:
-        """Let this obstacle give way to the rods from the next step on: what it is given by `obstacle_pose`
-        is where it would be without them. `translation` [m/N] under a force at its `center` (3,) of mass,
-        `rotation` (3, 3) [rad/(N m)] under a moment, both world and within one step: dt^2 / m and dt^2 I^-1
-        for a body in free flight. Obstacles of one rigid body have the same number `body`. Raises
-        `InputError` without a contact scene or where these are not numbers, `UnknownNameError`.
+        """Let this obstacle give way to the rods from the next step on.
+
+        `mobility` (6, 6): displacement [m] and rotation [rad] within one step by a force [N] at the `center`
+        (3,) [m] and a moment [N m]; dt^2 diag(1/m, 1/m, 1/m, I^-1) at its centre of mass for a body in free
+        flight, 0 for one that is held. Obstacles of one rigid body have the same number `body`. What it is
+        given by `obstacle_pose` is where it would be without the rods, or `ahead` (6,) of that by a
+        displacement and a rotation, as by their last forces: the nearer to where it comes, the more precise.
+        All in world axes. Raises `InputError` without a contact scene or where these are not such numbers,
+        `UnknownNameError`.
         """
         engine = self._contact("set_free")
-        k = engine.scene.index(obstacle)
-        engine.surfaces.mobility[k] = mobility(obstacle, translation, rotation, center)
-        engine.surfaces.body[k] = k if body is None else len(engine.surfaces.body) + body
+        surfaces, k = engine.surfaces, engine.scene.index(obstacle)
+        given = free_body(obstacle, mobility, center, ahead)
+        surfaces.mobility[k], surfaces.center[k], surfaces.ahead[k] = given
+        surfaces.body[k] = k if body is None else len(surfaces.body) + body
 
     def clearance(self, obstacle: str | None = None) -> Floats:
         """(n_robots,) smallest gap between the robot's surface and the obstacle of this name, or anything

@@ -167,9 +167,12 @@ class Surfaces(NamedTuple):
     body: Ints
     """(n_obstacles,) number of the rigid body that it is part of."""
     mobility: Floats
-    """(n_obstacles, 13) motion of that body within a step under a unit force at its centre of mass [m/N], and
-    its rotation under a unit moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m].
-    Zero: the body is not free, its pose is prescribed."""
+    """(n_obstacles, 6, 6) displacement [m] and rotation [rad] of that body within a step by a force [N] at
+    its `center` and a moment [N m], world. Zero: it is not free, its pose is prescribed."""
+    center: Floats
+    """(n_obstacles, 3) of that body, world [m]."""
+    ahead: Floats
+    """(n_obstacles, 6) by how much its pose is beyond where it would be without the rods [m, rad]."""
     root: Ints
     """(n_obstacles,) link to the top of a mesh's hierarchy."""
     box: Floats

@@ -64,7 +64,7 @@ def clearance_of(contact):
     sim = Simulator(robot, contact=scene)
     where = {
         "base_pose": (0.15, 0.1, 0.12, 1, 0, 0, 0),
-        "obstacle_pose": {name: contact.expected([])[0][name]},
+        "obstacle_pose": {name: contact.expected([], np.zeros(3))[0][name]},
     }
     state = sim.settle(robot.rest_tendon_length, **where)
     return sim.clearance()[0], state.position[0, [0, -1]]

@@ -263,7 +263,7 @@ class Engine:
 
     def _aside(self, poses: Floats, off: Floats) -> Floats:
         """Poses of bodies that are so far `off` (n_robots, n_obstacles, 6)."""
-        arm = poses[..., :3] - self.surfaces.mobility[:, 10:]
+        arm = poses[..., :3] - self.surfaces.center
         by = np.concatenate([off[..., :3] + cross(off[..., 3:], arm), off[..., 3:]], axis=-1)
         return displaced(np.broadcast_to(poses, (*by.shape[:2], 7)), by)
 
@@ -271,12 +271,13 @@ class Engine:
         """Let free bodies feel the forces of these robots for this `fraction` of a step."""
         if (yielded := self.yielded) is None:
             return
-        self.yielded, mobility, body = None, self.surfaces.mobility, self.surfaces.body
+        self.yielded, surfaces = None, self.surfaces
         wrench, self.yielded = self.contacts(shape, rows).wrench, yielded
-        moment = wrench[..., 3:] + cross(self.poses[..., :3] - mobility[:, 10:], wrench[..., :3])
-        turned = np.einsum("kij,nkj->nki", mobility[:, 1:10].reshape(-1, 3, 3), moment)
-        each = np.concatenate([mobility[:, :1] * wrench[..., :3], turned], axis=-1)
-        gained = np.einsum("kl,nli->nki", 1.0 * (body[:, None] == body), each)  # of all its obstacles
+        moment = wrench[..., 3:] + cross(self.poses[..., :3] - surfaces.center, wrench[..., :3])
+        there = np.concatenate([wrench[..., :3], moment], axis=-1)
+        each = np.einsum("kij,nkj->nki", surfaces.mobility, there)
+        same = 1.0 * (surfaces.body[:, None] == surfaces.body)  # of all its obstacles
+        gained = np.einsum("kl,nli->nki", same, each) - surfaces.ahead
         off, speed, mean = yielded
         speed[rows] += fraction * gained[rows]
         off[rows] += fraction * speed[rows]

@@ -51,6 +51,8 @@ def _gap(
         compliance=surfaces.compliance[which],
         body=surfaces.body[which],
         mobility=surfaces.mobility[which],
+        center=surfaces.center[which],
+        ahead=surfaces.ahead[which],
         root=surfaces.root[which],
     )
     frames = np.ascontiguousarray(frames_of(poses)[:, which])

@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array, checked_pose
 from fastrod.contact.geometry import Obstacle
-from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked, shown
+from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.model.robot import Robot
 from fastrod.types import ContactRods, Floats, Ints, Layout
 
@@ -185,38 +186,17 @@ class ContactScene:
         unit."""
         for name, value in (given or {}).items():
             k = self.index(name)
-            pose = _rows(f"obstacle_pose[{name!r}]", value, 7, n_robots, "position m, quaternion w x y z")
-            norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-            if not (np.abs(norm - 1.0) < 1e-3).all():
-                worst = float(norm[np.abs(norm - 1.0).argmax(), 0])
-                raise InputError(
-                    f"obstacle_pose[{name!r}] has a quaternion of norm {worst:.4g}; it must be 1, as w x y z."
-                )
+            pose = np.atleast_2d(checked_pose(f"obstacle_pose[{name!r}]", value, n_robots, 1))
             poses = np.repeat(poses, len(pose), axis=0) if len(poses) < len(pose) else poses.copy()
-            poses[:, k, :3], poses[:, k, 3:] = pose[:, :3], pose[:, 3:] / norm
+            poses[:, k] = pose
         return poses
 
     def velocities(self, given: Mapping[str, ArrayLike] | None, n_robots: int) -> dict[int, Floats]:
         """Obstacle index -> (1 or n_robots, 6) velocity of its origin [m/s] and angular velocity [rad/s],
         world."""
-        return {
-            self.index(name): _rows(f"obstacle_velocity[{name!r}]", value, 6, n_robots, "m/s, rad/s")
-            for name, value in (given or {}).items()
-        }
-
-
-def _rows(name: str, value: ArrayLike, width: int, n_robots: int, unit: str) -> Floats:
-    refuse_masked(name, value)
-    try:
-        a = np.atleast_2d(np.asarray(value, float))
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{name} is not an array of numbers; give ({width},) or ({n_robots}, {width}) [{unit}]."
-        ) from error
-    if a.ndim != 2 or a.shape[1] != width or len(a) not in (1, n_robots):
-        raise InputError(
-            f"{name} has shape {np.shape(value)}; it must be ({width},) or ({n_robots}, {width}) [{unit}]."
-        )
-    if not np.isfinite(a).all():
-        raise InputError(f"{name} holds a value that is not finite.")
-    return a
+        says, shapes = "velocity [m/s] and angular velocity [rad/s], world", [(6,), (n_robots, 6), (1, 6)]
+        found = {}
+        for name, value in (given or {}).items():
+            twist = checked_array(f"obstacle_velocity[{name!r}]", value, shapes, says)
+            found[self.index(name)] = np.atleast_2d(twist)
+        return found

@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array, checked_pose
 from fastrod.errors import InputError
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
@@ -47,7 +48,7 @@ class FixedBase:
     """(7,) world_from_flange, position [m] and quaternion w x y z."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pose", tuple(_pose("FixedBase.pose", self.pose).tolist()))
+        object.__setattr__(self, "pose", tuple(checked_pose("FixedBase.pose", self.pose).tolist()))
 
     @property
     def n_joints(self) -> int:
@@ -78,7 +79,7 @@ class MovingBase:
     rotates: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pose", tuple(_pose("MovingBase.pose", self.pose).tolist()))
+        object.__setattr__(self, "pose", tuple(checked_pose("MovingBase.pose", self.pose).tolist()))
 
     @property
     def n_joints(self) -> int:
@@ -138,7 +139,7 @@ class SoftTip:
         self.n_q = self.n_base + self.actions.n_actions
         """Coordinates of all."""
         self._rest = np.concatenate([robot.rest_tendon_length, np.zeros(robot.n_segments)])
-        mount = _pose("flange_from_base", flange_from_base)
+        mount = checked_pose("flange_from_base", flange_from_base)
         self._mount = None if np.array_equal(mount, _STRAIGHT) else mount
         self._q: Floats | None = None
         self._base_pose: Floats = np.zeros(7)
@@ -154,7 +155,7 @@ class SoftTip:
         obstacle_pose, ... Raises `InputError`.
         """
         q = self._read(q)
-        pose = self._carried(q) if base_pose is None else _pose("base_pose", base_pose)
+        pose = self._carried(q) if base_pose is None else checked_pose("base_pose", base_pose)
         state = self._move(q, pose, settle, loads)
         self._q, self._base_pose, self._state = q, pose, state
         return state
@@ -163,7 +164,7 @@ class SoftTip:
         """Be where a step of the simulator that was taken elsewhere, as a host does, has left the robot:
         `state` is that of the simulator's last step, q (n_q,) the coordinates that it belongs to, `base_pose`
         (7,) as for `place`. Raises `InputError`."""
-        q, pose = self._read(q), _pose("base_pose", base_pose)
+        q, pose = self._read(q), checked_pose("base_pose", base_pose)
         self._q, self._base_pose, self._state = q, pose, state
 
     @property
@@ -271,19 +272,9 @@ class SoftTip:
         return np.asarray(base @ flange.T @ mount[:3])
 
     def _read(self, q: ArrayLike) -> Floats:
-        try:
-            found = np.array(q, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"q is {q!r}; give {self.n_q} numbers.") from error
-        if found.shape != (self.n_q,):
-            raise InputError(
-                f"q has shape {found.shape}; it must be ({self.n_q},): {self.n_base} of the base, then "
-                "extension and two displacements "
-                f"for each of {len(self.actions.offset)} segments [m]."
-            )
-        if not np.isfinite(found).all():
-            raise InputError(f"q holds a value that is not finite: {found}.")
-        return found
+        n, segments = self.n_base, len(self.actions.offset)
+        says = f"{n} of the base, then extension and two displacements for each of {segments} segments [m]"
+        return checked_array("q", q, [(self.n_q,)], says)
 
     def _with_state(self, what: str) -> tuple[Floats, State]:
         if self._q is None or self._state is None:
@@ -307,17 +298,3 @@ def _rotation_jacobian(v: Floats) -> Floats:
         else ((1.0 - math.cos(a)) / a**2, (a - math.sin(a)) / a**3)
     )
     return np.asarray(np.eye(3) + one * hat + two * hat @ hat)
-
-
-def _pose(name: str, pose: ArrayLike) -> Floats:
-    try:
-        found = np.array(pose, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.empty(0)
-    if found.shape != (7,) or not np.isfinite(found).all():
-        raise InputError(
-            f"{name} is {pose!r}; give seven finite numbers, position [m] and quaternion w x y z."
-        )
-    if abs((norm := float(np.linalg.norm(found[3:]))) - 1.0) > 1e-6:
-        raise InputError(f"{name} has a quaternion of norm {norm:.6g}; it must be 1, as w x y z.")
-    return found

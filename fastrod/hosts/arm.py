@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array, checked_pose
 from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.link import to_xyzw
@@ -87,13 +88,9 @@ class BulletArm:
         `quaternion` (4,) w x y z, world. Raises `HostError` for a file that PyBullet cannot load,
         `InputError` for a pose that is none."""
         b = Bullet(bullet)
-        place, orientation = _floats(position), _floats(quaternion)
-        if place.shape != (3,) or orientation.shape != (4,):
-            raise InputError(
-                f"the arm's base is at {position!r}, {quaternion!r}; give position (3,) [m] "
-                "and quaternion (4,) w x y z."
-            )
-        pose = _target(np.concatenate([place, orientation]), "base pose", (7,))
+        place = checked_array("position", position, [(3,)], "of the arm's base, world [m]")
+        orientation = checked_array("quaternion", quaternion, [(4,)], "of the arm's base, w x y z")
+        pose = checked_pose("the arm's base", np.concatenate([place, orientation]))
         flags = b.URDF_USE_INERTIA_FROM_FILE
         try:
             body = b.loadURDF(
@@ -118,8 +115,8 @@ class BulletArm:
     def place(self, q: ArrayLike, q_dot: ArrayLike = 0.0) -> None:
         """Be at q with velocity `q_dot`, (n_joints,) or one for all, at once; hold q from then on. Raises
         `InputError`."""
-        to, rate = self._inside(q, "q"), _floats(q_dot)
-        rate = self._checked(np.full(self.n_joints, rate) if rate.ndim == 0 else rate, "q_dot")
+        to = self._inside(q, "q")
+        rate = self._checked(np.full(self.n_joints, q_dot) if np.ndim(q_dot) == 0 else q_dot, "q_dot")
         for joint, p, v in zip(self._joint, to.tolist(), rate.tolist(), strict=True):
             self.bullet.resetJointState(self.body, joint, p, v)
         self.drive(to)
@@ -161,8 +158,9 @@ class BulletArm:
         around it; the same q every time. Raises `InputError` for what is no pose, `HostError` where no q is
         found.
         """
-        to = _target(target, "target", (3,), (7,))
+        to = checked_array("target", target, [(3,), (7,)], "a position [m] or a pose, world")
         rows = 6 if len(to) == 7 else 3
+        to = checked_pose("target", to) if rows == 6 else to
         goal = _matrix(to[:3].tolist(), to_xyzw(to[3:]).tolist() if rows == 6 else (0.0, 0.0, 0.0, 1.0))
         start = self._inside(q0, "q0")
         rng = np.random.default_rng(0)
@@ -246,13 +244,8 @@ class BulletArm:
         return np.array(columns).T
 
     def _checked(self, values: ArrayLike, name: str) -> Floats:
-        v = _floats(values)
-        if v.shape != (self.n_joints,) or not np.isfinite(v).all():
-            raise InputError(
-                f"{name} is {values!r}; give {self.n_joints} finite numbers, one for each of "
-                f"{', '.join(self.names)}."
-            )
-        return v
+        says = f"a number for each of {', '.join(self.names)}"
+        return checked_array(name, values, [(self.n_joints,)], says)
 
     def _inside(self, values: ArrayLike, name: str) -> Floats:
         q = self._checked(values, name)
@@ -364,30 +357,6 @@ def _quaternion(rotation: Floats) -> tuple[float, float, float, float]:
 def _pose(matrix: Floats) -> Floats:
     """(7,) of (4, 4)."""
     return np.array([*matrix[:3, 3].tolist(), *_quaternion(matrix[:3, :3])])
-
-
-def _floats(values: ArrayLike) -> Floats:
-    """Return an array of floats; an empty one for what are no numbers, which has no valid shape."""
-    try:
-        return np.asarray(values, float)
-    except (TypeError, ValueError):
-        return np.empty(0)
-
-
-def _target(values: ArrayLike, name: str, *shapes: tuple[int]) -> Floats:
-    pose = _floats(values)
-    if pose.shape not in shapes or not np.isfinite(pose).all():
-        kinds = " or ".join(
-            "a position (3,)" if n == 3 else "position and quaternion w x y z (7,)" for (n,) in shapes
-        )
-        raise InputError(f"{name} is {values!r}; give {kinds}, world, in m.")
-    if len(pose) == 7 and abs((norm := float(np.linalg.norm(pose[3:]))) - 1.0) > 1e-6:
-        raise InputError(
-            f"the {name}'s quaternion {pose[3:].tolist()} has norm {norm:.6g}; it must be 1, as w x y z."
-        )
-    if len(pose) == 7:
-        pose = np.concatenate([pose[:3], pose[3:] / np.linalg.norm(pose[3:])])
-    return pose
 
 
 def _error(goal: Floats, tip: Floats, rows: int) -> Floats:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from fastrod.contact import Obstacle
-from fastrod.hosts.host import Motion
+from fastrod.hosts.host import Motion, inverse_inertia
 from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.solver.state import State
 from fastrod.types import Floats
@@ -43,15 +43,25 @@ class BodyContact(ABC):
     swings: where a contact lasts the body feels a mean of the last three forces instead (Newmark 1959), of
     which the coming one is a third.
 
+    Of several rods that push one body each has it under the forces of all, and moves it on from there: so
+    they hold it between them. It feels the coming force alone: a mean of what sticks, which is rigid, rings.
+
     After a step in which the rod's forces are not known it only stops the body, until that takes all it has.
     """
 
     def __init__(
-        self, shapes: Sequence[CollisionShape], mass: float, inertia: Floats, *, dt: float, friction: float
+        self,
+        body: tuple[int, ...],
+        shapes: Sequence[CollisionShape],
+        mass: float,
+        inertia: Floats,
+        *,
+        dt: float,
+        friction: float,
     ) -> None:
-        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `friction` of rod on the
-        body."""
-        self.dt = dt
+        """`body`: number of its world, and its own; `inertia` (3,) about the axes of the centre of mass'
+        frame [kg m^2]; `friction` of rod on the body."""
+        self.number, self.dt = body, dt
         self.mass = mass
         """0: it does not move for the rod [kg]."""
         self._inertia: Floats = np.maximum(inertia, 1e-12)
@@ -63,9 +73,13 @@ class BodyContact(ABC):
         self.exerted: Floats = np.zeros(6)
         """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step,
         world."""
+        self._begun = False  # the rod has pushed since the engine's step
+        self._felt: Floats = np.zeros(6)  # what it exerted in that
+        self._speed: Floats = np.full(3, np.nan)  # of the body before that
         self._poses: dict[str, Floats] = {}  # of its obstacles, as the step expects them
         self._before: Floats = np.zeros(6)
         self._lost = False  # the rod's forces of the last step were not known
+        self._alone = True  # no other rod pushes it
         self._even = False  # the last force was like the one before it
         self._weight, self._past = 1.0, np.zeros(6)  # of the coming force, and of those before it
         self._then: dict[str, Any] = {}  # all this before the last push
@@ -85,30 +99,38 @@ class BodyContact(ABC):
         step, with what was applied for that before."""
 
     @final
-    def mobility(self, pose: Floats | None = None) -> tuple[float, Floats, Floats]:
-        """Return its mobility in the next step: displacement per force [m/N] and rotation per moment (3, 3)
-        [rad/(N m)], and its centre of mass (3,); at the `pose` (7,) of that, or where it is now."""
-        pose = self.com().pose if pose is None else pose
-        if self.mass == 0.0:
-            return 0.0, np.zeros((3, 3)), pose[:3]
-        rotation = matrix_from_quaternion(pose[None, 3:])[0]
-        by_force, by_moment = 1.0 / self.mass, rotation @ (rotation.T / self._inertia[:, None])
-        square = self._weight * self.dt**2
-        return square * by_force, square * by_moment, pose[:3]
+    def mobility(self) -> tuple[Floats, Floats, Floats]:
+        """Return its mobility (6, 6) in the next step: displacement [m] and rotation [rad] by a force [N] at
+        its centre of mass and a moment [N m], world; that centre (3,), where it is now; and how far (6,)
+        `expected` has the rod push it."""
+        pose = self.com().pose
+        mobility = self._weight * self.dt**2 * inverse_inertia(self.mass, self._inertia, pose)
+        return mobility, pose[:3], mobility @ (np.zeros(6) if self._alone else self._before)
 
     @final
-    def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    def expected(
+        self, capsules: Sequence[int], gravity: Floats, others: Sequence[BodyContact] = ()
+    ) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Return pose (7,) and velocity (6,) of each shape at the end of the next step, were it not for the
-        rod.
+        rod. What fell by `gravity` (3,) in the last one falls on. If `others` push the body, it is pushed as
+        they have begun to, or else as in the last one, and by the rod as in that.
 
         What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected mostly
         outside: out at once it would leave at overlap / dt.
         """
         motion = self.com()
         if self.mass > 0.0:
-            by_force, by_moment, _ = self.mobility(motion.pose)
-            change = np.concatenate([by_force * self._past[:3], by_moment @ self._past[3:]])
-            motion = motion._replace(velocity=motion.velocity + change / (self._weight * self.dt))
+            theirs = sum((other._coming for other in others), np.zeros(6))
+            self._alone = not theirs.any()
+            coming = theirs + (self._past if self._alone else self._coming)
+            by_force = inverse_inertia(self.mass, self._inertia, motion.pose)
+            velocity = motion.velocity + self.dt * by_force @ coming
+            felt = sum((other._felt for other in others), self._felt)
+            gained, expected = motion.velocity[:3] - self._speed, felt[:3] / self.mass + gravity
+            if np.linalg.norm(gained - self.dt * expected) < 0.5 * self.dt * np.linalg.norm(gravity):
+                velocity[:3] += self.dt * gravity
+            self._speed = motion.velocity[:3]
+            motion = motion._replace(velocity=velocity)
         pose = motion.after(self.dt)
         if self.mass > 0.0:
             pose[:3] += _LEFT * self.overlap(capsules)
@@ -122,6 +144,16 @@ class BodyContact(ABC):
         self._poses = poses
         return poses, velocities
 
+    @property
+    def _coming(self) -> Floats:
+        """(6,) what the rod exerts in this step, or would if it pushed as in the last one."""
+        return self.exerted if self._begun else self._weight * self._before + self._past
+
+    @final
+    def end(self) -> None:
+        """After the engine's step: it has felt what was exerted."""
+        self._begun, self._felt = False, self.exerted
+
     @final
     def push(self, state: State, again: bool = False) -> tuple[Floats, Floats]:
         """Exert the forces of the rod in its contacts with this body; `again` in place of the last ones.
@@ -130,6 +162,7 @@ class BodyContact(ABC):
         the rod's host takes its opposite.
         """
         com, wrench, there = self.com().pose[:3], np.zeros(6), self.exerted if again else np.zeros(6)
+        self._begun = True
         if self.mass == 0.0:
             return np.zeros(6), com
         if again:
@@ -150,7 +183,7 @@ class BodyContact(ABC):
         more += (fraction - 1.0) * (wrench + more)
         self._lost = fraction < 1.0 and bool(wrench.any())
         even = bool(np.linalg.norm(wrench - self._before) < _ALIKE * np.linalg.norm(wrench))
-        if even and self._even:
+        if even and self._even and self._alone:
             felt = _FELT if self._weight == 1.0 else 0.0
             self._weight, self._past = _COMING, (_LAST - felt) * wrench + _EARLIER * self._before
         else:
@@ -164,7 +197,7 @@ class BodyContact(ABC):
         """Exert half of the last forces, as far as they stop the body: for a step in which the rod's are not
         known."""
         half = self._stopping(0.5 * self.exerted) * 0.5 * self.exerted
-        self._before, self.exerted, self._lost = 0.5 * self._before, half, True
+        self._before, self.exerted, self._lost, self._begun = 0.5 * self._before, half, True, True
         self._begin_anew()
         self._exert(half)
 
@@ -172,6 +205,7 @@ class BodyContact(ABC):
     def forget(self) -> None:
         """The body was put somewhere else: no force carries over."""
         self._before, self.exerted, self._lost = np.zeros(6), np.zeros(6), False
+        self._begun, self._felt, self._speed = False, np.zeros(6), np.full(3, np.nan)
         self._begin_anew()
 
     def _stopping(self, wrench: Floats) -> float:

@@ -72,6 +72,7 @@ class CarriedRod(ABC):
         self.wrench: Floats = np.zeros(6)
         """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
         self._begun: _Begun | None = None
+        self.body_contacts = ()
         _RODS[id(self)] = self
 
     @abstractmethod
@@ -164,6 +165,8 @@ class CarriedRod(ABC):
             raise HostError("end() comes after begin() and the world's step.")
         self._release()
         self._begun = None
+        for contact in self.body_contacts:
+            contact.end()
         self._place()
 
     @final
@@ -189,8 +192,7 @@ class CarriedRod(ABC):
         """One step of a rod that moves, and of those on the same body that have begun theirs: these are taken
         to give way by their stiffness, then do their step again where that has them, until both say the
         same."""
-        every = [rod for ref in _RODS.valuerefs() if (rod := ref()) and rod._begun and rod is not self]
-        others = [rod for rod in every if self._host.moves_with(rod._host)]
+        others = [rod for rod in self._others() if rod._begun and self._host.moves_with(rod._host)]
         before = self.rod.snapshot()
         for again in reversed(range(_ROUNDS)):
             freedom = self._host.freedom(self.dt, [(rod._host, rod.wrench) for rod in others])
@@ -205,6 +207,10 @@ class CarriedRod(ABC):
         held = {"inverse_inertia": _HELD * freedom.inverse_inertia[:6, :6]}
         self._begun = _Begun(before, motion, given | held)
         return state
+
+    def _others(self) -> list[CarriedRod]:
+        """All other rods of this process."""
+        return [rod for ref in _RODS.valuerefs() if (rod := ref()) and rod is not self]
 
     def _stiffness(self) -> tuple[Floats, Floats]:
         """(6, 6) by how much the rod's wrench falls by more motion of its base in the step that it has begun,
@@ -252,10 +258,13 @@ class CarriedRod(ABC):
             return world
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
+        theirs = [other for rod in self._others() for other in rod.body_contacts]
         for k, contact in enumerate(self.body_contacts):
-            p, v = contact.expected(self._shapes())
+            others = [other for other in theirs if other.number == contact.number]
+            p, v = contact.expected(self._shapes(), world["gravity"], others)
             for name in contact.names:
-                self.simulator.set_free(name, *contact.mobility(), body=k)
+                mobility, center, ahead = contact.mobility()
+                self.simulator.set_free(name, mobility, center, k, ahead)
             poses |= p
             velocities |= v
         return world | {"obstacle_pose": poses, "obstacle_velocity": velocities}

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from fastrod.rotation import displaced
+import numpy as np
+
+from fastrod.rotation import displaced, matrix_from_quaternion
 from fastrod.types import Floats
 
 
@@ -20,6 +22,17 @@ class Motion(NamedTuple):
     def after(self, time: float) -> Floats:
         """(7,) pose after this time [s] at constant velocity."""
         return displaced(self.pose, time * self.velocity)
+
+
+def inverse_inertia(mass: float, inertia: Floats, pose: Floats) -> Floats:
+    """(6, 6) linear and angular acceleration of a free body by force at its centre of mass and moment, world,
+    of its `inertia` (3,) about the axes of that frame (7,) [kg m^2]; 0 of a `mass` 0 [kg], which stands."""
+    found = np.zeros((6, 6))
+    if mass > 0.0:
+        rotation = matrix_from_quaternion(pose[None, 3:])[0]
+        found[:3, :3] = np.eye(3) / mass
+        found[3:, 3:] = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
+    return found
 
 
 class Freedom(NamedTuple):

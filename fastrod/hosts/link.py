@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.host import Freedom, Host, Motion
+from fastrod.hosts.host import Freedom, Host, Motion, inverse_inertia
 from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -123,10 +123,7 @@ class BulletLink:
         bullet = self.bullet
         mass, _, inertia = bullet.getDynamicsInfo(self.body, link)[:3]
         pose = com_motion(bullet, self.body, link).pose
-        rotation = matrix_from_quaternion(pose[None, 3:])[0]
-        by_wrench = np.zeros((6, 6))
-        by_wrench[:3, :3] = np.eye(3) / mass
-        by_wrench[3:, 3:] = rotation @ (rotation.T / np.maximum(inertia, 1e-12)[:, None])
+        by_wrench = inverse_inertia(mass, np.array(inertia), pose)
         slopes = np.tile(np.eye(6), (len(points), 1, 1))
         slopes[:, :3, 3:] = [np.cross(point - pose[:3], np.eye(3)) for point in points]  # -[arm]x
         jacobian = slopes.reshape(-1, 6)

@@ -35,7 +35,8 @@ class BulletBodyContact(BodyContact):
         shapes = _shapes(self.bullet, body, link)
         if not shapes:
             raise HostError(f"link {link} of body {body} has no collision shape, so nothing can touch it.")
-        super().__init__(shapes, mass, np.asarray(inertia), dt=dt, friction=friction)
+        number = self.bullet.number, body, link
+        super().__init__(number, shapes, mass, np.asarray(inertia), dt=dt, friction=friction)
 
     def com(self) -> Motion:
         """Motion of the centre of mass' frame, not of the link's URDF frame."""
@@ -152,7 +153,8 @@ class MountedRod(CarriedRod):
             self.bodies.ignore(body)
 
     def remove(self) -> None:
-        """Take the rod's capsules out of the world."""
+        """Take the rod out of the world: its capsules, and its force on what it touched."""
+        self.reset()
         self.bodies.remove()
 
     def _look(self) -> None:

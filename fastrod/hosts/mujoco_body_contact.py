@@ -36,7 +36,8 @@ class MujocoBodyContact(BodyContact):
         mass = 0.0 if still else float(model.body_mass[body])
         shapes = _shapes(model, body, self.geoms)
         self._applied = Applied(data, body)
-        super().__init__(shapes, mass, model.body_inertia[body].copy(), dt=dt, friction=friction)
+        number, inertia = (id(data), body), model.body_inertia[body].copy()
+        super().__init__(number, shapes, mass, inertia, dt=dt, friction=friction)
 
     def com(self) -> Motion:
         """Motion of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import Bound, check_number, checked_array, checked_pose
 from fastrod.contact import ContactScene
 from fastrod.contact.frames import between
 from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
@@ -22,7 +23,7 @@ from fastrod.rotation import quaternion_from_matrix
 from fastrod.simulator import Simulator
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.merge import merge_shape
-from fastrod.solver.motion import checked_mobility
+from fastrod.solver.motion import checked_inertia
 from fastrod.solver.options import Modal, Modes
 from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints
@@ -456,14 +457,7 @@ class Rod:
         )
 
     def _substeps(self, time_step: float) -> int:
-        if isinstance(time_step, bool) or not isinstance(time_step, (int, float, np.floating, np.integer)):
-            raise InputError(
-                f"time_step is {time_step!r}; give the length of the engine's step, a positive number [s]."
-            )
-        if not (math.isfinite(time_step) and time_step > 0.0):
-            raise InputError(
-                f"time_step is {time_step!r} s; the length of the engine's step must be positive and finite."
-            )
+        check_number("time_step", time_step, Bound(above=0.0, unit="s"))
         n = max(1, math.ceil(time_step / self.dt - 1e-9))
         if n > _MOST_SUBSTEPS:
             raise InputError(
@@ -487,7 +481,7 @@ class Rod:
                 )
             return None
         twist = motion.velocity if free_twist is None else self._twists(free_twist)
-        given = checked_mobility(inverse_inertia, self.simulator.n_robots)
+        given = checked_inertia(inverse_inertia, self.simulator.n_robots)
         if self._weighs and not self.simulator.dynamics:
             raise InputError(
                 "inverse_inertia was given, and this rod has a mass, which its base must feel; give "
@@ -496,31 +490,12 @@ class Rod:
         return Freedom(given, np.broadcast_to(twist, motion.velocity.shape))
 
     def _poses(self, base_pose: ArrayLike) -> Floats:
-        pose = self._rows("base_pose", base_pose, 7, "position [m] and quaternion w x y z")
-        norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
-        if (off := np.abs(norm - 1.0)).max() > 1e-3:
-            raise InputError(
-                f"base_pose has a quaternion of norm {norm.ravel()[off.argmax()]:.4g}; it must "
-                "be 1, as w x y z."
-            )
-        return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)
+        return checked_pose("base_pose", base_pose, *([] if self.n_robots is None else [self.n_robots]))
 
     def _twists(self, base_twist: ArrayLike) -> Floats:
-        return self._rows("base_twist", base_twist, 6, "velocity [m/s] and angular velocity [rad/s]")
-
-    def _rows(self, name: str, value: ArrayLike, width: int, what: str) -> Floats:
-        """(width,), or (n_robots, width)."""
-        refuse_masked(name, value)
-        shapes = f"({width},)" if self.n_robots is None else f"({width},) or ({self.n_robots}, {width})"
-        try:
-            a = np.array(value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} is not an array of numbers; give {shapes}, {what}, world.") from error
-        if a.shape != (width,) and (self.n_robots is None or a.shape != (self.n_robots, width)):
-            raise InputError(f"{name} has shape {a.shape}; it must be {shapes}, {what}, world.")
-        if not np.isfinite(a).all():
-            raise InputError(f"{name} holds a value that is not finite: {a.ravel()[: 2 * width].tolist()}.")
-        return a
+        shapes = [(6,)] if self.n_robots is None else [(6,), (self.n_robots, 6)]
+        says = "velocity [m/s] and angular velocity [rad/s], world"
+        return checked_array("base_twist", base_twist, shapes, says)
 
     def _one(self, a: Floats) -> Floats:
         return a.copy() if self.n_robots is not None else a[0].copy()

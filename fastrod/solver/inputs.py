@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array
 from fastrod.errors import InputError, Problem, ProblemSentence, nearest, refuse_masked, shown
 from fastrod.kernels.batch import place_all
 from fastrod.model.compile import DefaultInputs
@@ -91,22 +92,30 @@ def arclengths(arclength: ArrayLike, n_robots: int) -> Floats:
     return np.broadcast_to(s, (n_robots, s.shape[1]))
 
 
-def mobility(obstacle: str, translation: float, rotation: ArrayLike, center: ArrayLike) -> Floats:
-    """(13,) how far an obstacle's body moves (`Surfaces.give`). Raises `InputError`."""
-    for name, given in (("translation", translation), ("rotation", rotation), ("center", center)):
-        refuse_masked(name, given)
-    try:
-        numbers = np.concatenate([np.ravel(np.asarray(a)) for a in (translation, rotation, center)]).astype(
-            float
-        )
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.full(0, np.nan)
-    if numbers.shape != (13,) or not np.isfinite(numbers).all() or not numbers[0] >= 0.0:
+def checked_mobility(name: str, given: ArrayLike, shapes: Sequence[tuple[int, ...]], says: str) -> Floats:
+    """Mobility of a body, of one of these shapes (..., 6, 6): its motion, which `says` what that is, by a
+    force and a moment at a point. Raises `InputError` for what is none."""
+    found = checked_array(name, given, shapes, says)
+    size, even = np.abs(found).max(), 0.5 * (found + np.swapaxes(found, -1, -2))
+    if np.abs(found - even).max() > 1e-6 * size or np.linalg.eigvalsh(even).min() < -1e-6 * size:
         raise InputError(
-            f"the mobility of {obstacle!r} is {numbers.tolist()}; give [m/N], (3, 3) [rad/(N m)] and "
-            "(3,) [m], finite, none negative."
+            f"{name} is not symmetric with eigenvalues of 0 or more; for a free body of mass m and inertia J "
+            "about its centre, which is that point, it is a multiple of diag(1/m, 1/m, 1/m, inv(J))."
         )
-    return numbers
+    return even
+
+
+def free_body(
+    obstacle: str, mobility: ArrayLike, center: ArrayLike, ahead: ArrayLike
+) -> tuple[Floats, Floats, Floats]:
+    """Mobility (6, 6) of an obstacle's body, its centre (3,), and how far it is ahead (6,), as
+    `Simulator.set_free`. Raises `InputError`."""
+    says, name = "displacement and rotation within a step by force and moment, world", f"of {obstacle!r}"
+    return (
+        checked_mobility(f"mobility {name}", mobility, [(6, 6)], says),
+        checked_array(f"center {name}", center, [(3,)], "its place, world [m]"),
+        checked_array(f"ahead {name}", ahead, [(6,)], "displacement [m] and rotation [rad], world"),
+    )
 
 
 class Inputs(NamedTuple):

@@ -8,13 +8,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array
 from fastrod.errors import InputError, Problem, shown
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.motion import ModalMotion
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.solver.boundary import new_shape
-from fastrod.solver.inputs import Inputs, arclengths
+from fastrod.solver.inputs import Inputs, arclengths, checked_mobility
 from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, mean_by_end, no_hosts
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.options import Modal, Modes
@@ -37,24 +38,11 @@ class ModalMemory(NamedTuple):
     """That the motion is remembered for; None at rest."""
 
 
-def checked_mobility(inverse_inertia: ArrayLike, n_robots: int) -> Floats:
+def checked_inertia(inverse_inertia: ArrayLike, n_robots: int) -> Floats:
     """(n_robots, 6, 6) inverse inertia of bodies at a point. Raises `InputError` for what is none."""
-    try:
-        given = np.array(inverse_inertia, dtype=float)
-    except (TypeError, ValueError):
-        given = np.empty(0)
-    if given.shape not in ((6, 6), (n_robots, 6, 6)) or not np.isfinite(given).all():
-        raise InputError(
-            f"inverse_inertia has shape {given.shape}; give (6, 6) or ({n_robots}, 6, 6) finite numbers: "
-            "linear and angular acceleration of the base by force and moment, world."
-        )
-    size, even = np.abs(given).max(), 0.5 * (given + np.swapaxes(given, -1, -2))
-    if np.abs(given - even).max() > 1e-6 * size or np.linalg.eigvalsh(even).min() < -1e-6 * size:
-        raise InputError(
-            "inverse_inertia is not symmetric with eigenvalues of 0 or more; for a free body of mass m and "
-            "inertia J about its centre at the base it is diag(1/m, 1/m, 1/m, inv(J))."
-        )
-    return np.array(np.broadcast_to(even, (n_robots, 6, 6)))
+    says = "linear and angular acceleration of the base by force and moment, world"
+    given = checked_mobility("inverse_inertia", inverse_inertia, [(6, 6), (n_robots, 6, 6)], says)
+    return np.array(np.broadcast_to(given, (n_robots, 6, 6)))
 
 
 class ModalRods:
@@ -120,7 +108,7 @@ class ModalRods:
                 "inverse_inertia needs outputs='full', and goes neither with estimate_error nor with "
                 "record()."
             )
-        given = checked_mobility(inverse_inertia, self.n_robots)
+        given = checked_inertia(inverse_inertia, self.n_robots)
         return hosts_of(given, float(np.max(self.modal.params.rod_length)))
 
     def new_shape(self, outputs: Literal["full", "tip"], holes: bool) -> RodShape:
@@ -248,12 +236,8 @@ class ModalRods:
 
     def set_in_motion(self, base_twist: ArrayLike, rows: Ints) -> None:
         """Let these robots, at rest, move on as `Simulator.set_in_motion` says."""
-        twist = np.asarray(base_twist, float)
-        if twist.shape not in ((6,), (self.n_robots, 6)) or not np.isfinite(twist).all():
-            raise InputError(
-                f"base_twist has shape {twist.shape}; give (6,) or ({self.n_robots}, 6) finite numbers: "
-                "velocity [m/s] and angular velocity [rad/s], world."
-            )
+        says = "velocity [m/s] and angular velocity [rad/s], world"
+        twist = checked_array("base_twist", base_twist, [(6,), (self.n_robots, 6)], says)
         self.stepper.begun[rows] = True
         every, time = np.broadcast_to(twist, (self.n_robots, 6)), self.stepper.time
         self.modal.set_in_motion(rows, every[rows], time.scheme, time.dt)

@@ -274,7 +274,7 @@ class TouchingRods(ModalRods):
     def _is_rigid(self) -> bool:
         """Whether nothing that the rods touch gives way."""
         surfaces, rods = self.engine.surfaces, self.engine.rods
-        return not (surfaces.compliance.any() or surfaces.mobility[:, 0].any() or rods.compliance > 0.0)
+        return not (surfaces.compliance.any() or surfaces.mobility.any() or rods.compliance > 0.0)
 
     def _hold_up(self, rows: Ints) -> None:
         """Take the motion of these robots from them."""

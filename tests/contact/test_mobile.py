@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from rods import rod
 
 from fastrod.contact import ContactScene, box, plane
 from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
 
+SHIFTS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 PULL = np.array([-0.009, 0.0, 0.009, 0.0])
 
 
@@ -29,18 +32,40 @@ def pressed(rest, sim, most=1.0):
 @pytest.mark.parametrize("give", [1e-5, 1e-2, 1e-3])
 def test_body_that_only_shifts_is_a_spring(give):
     rest, sim = wall_and_rod()
-    sim.set_free("wall", give, np.zeros((3, 3)), np.zeros(3))
+    sim.set_free("wall", give * SHIFTS, np.zeros(3))
     free = pressed(rest, sim)
     spring = pressed(*wall_and_rod(stiffness=1.0 / give))
     np.testing.assert_allclose(free.force[0, 0], spring.force[0, 0], rtol=1e-4)  # a step is at rest to 1e-6 m
     assert -free.gap[0, 0] == pytest.approx(give * np.linalg.norm(free.force[0, 0]), rel=1e-2, abs=1e-6)
 
 
+@pytest.mark.parametrize("give", [1e-5, 1e-2])
+def test_where_a_body_that_is_touched_is_expected_does_not_matter(give):
+    place, dt = np.array([0.06, 0.0, 0.05]), 0.005
+    scene = ContactScene(obstacles=[box((0.08, 0.2, 0.2), name="wall", position=place, friction=0.2)])
+    sims = [Simulator(rod(damping_time=0.02), dynamics=True, dt=dt, contact=scene) for _ in range(2)]
+    length = np.array(sims[0].robots[0].rest_tendon_length)
+    for sim in sims:
+        sim.settle(length)
+    ahead, largest = np.zeros(6), 0.0
+    for k in range(60):
+        change = 0.003 * np.sin(k / 12.0) * np.resize([-1.0, 0.0, 1.0, 0.0], len(length))
+        sims[0].set_free("wall", give * SHIFTS, np.zeros(3))
+        plain = sims[0].step(length + change, obstacle_velocity={"wall": np.zeros(6)})
+        sims[1].set_free("wall", give * SHIFTS, np.zeros(3), ahead=ahead)
+        poses = {"wall": (*(place + ahead[:3]), 1.0, 0.0, 0.0, 0.0)}
+        moved = sims[1].step(length + change, obstacle_pose=poses, obstacle_velocity={"wall": ahead / dt})
+        force = plain.contacts.wrench[0, 0, :3]
+        assert_allclose(moved.contacts.wrench[0, 0, :3], force, atol=1e-6 * np.abs(force).max())
+        ahead[:3], largest = give * force, max(largest, np.abs(force).max())
+    assert largest > 0.05
+
+
 def test_friction_moves_a_free_body_along():
     # what gives way in every direction feels less friction than what is held: it goes with the rod
     held = pressed(*wall_and_rod(friction=0.1), most=0.6)
     rest, sim = wall_and_rod(friction=0.1)
-    sim.set_free("wall", 0.05, np.zeros((3, 3)), np.zeros(3))
+    sim.set_free("wall", 0.05 * SHIFTS, np.zeros(3))
     free = pressed(rest, sim, most=0.6)
     assert abs(free.force[0, 0, 2]) < abs(held.force[0, 0, 2])
 
@@ -52,7 +77,7 @@ def test_body_that_is_hit_off_its_middle_gives_way_by_turning():
     depth = {}
     for turn in (0.0, 2.0):
         sim = Simulator(robot, points_per_segment=10, contact=scene)
-        sim.set_free("box", 1e-4, turn * np.eye(3), center)
+        sim.set_free("box", np.diag(np.repeat([1e-4, turn], 3)), center)
         contacts = pressed(robot.rest_tendon_length, sim)
         lever = np.cross(contacts.point[0, 0] - center, contacts.normal[0, 0])
         expected = (1e-4 + turn * lever @ lever) * (contacts.force[0, 0] @ contacts.normal[0, 0])

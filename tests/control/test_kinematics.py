@@ -167,27 +167,28 @@ def test_moving_in_the_null_space_leaves_the_tip() -> None:
     assert moved[1] == pytest.approx(moved[0] / 4.0, rel=0.1)
 
 
-SEVEN = "give seven finite numbers, "
-
-
 BAD_INPUT = {
     r"^simulator is Simulator\(.*\); give a Simulator of one robot\.$": lambda: SoftTip(simulator(2)),
-    rf"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); {SEVEN}position \[m\] and ": lambda: FixedBase(
+    r"^FixedBase\.pose has shape \(3,\); it must be \(7,\), position \[m\] and ": lambda: FixedBase(
         (0.0, 0.0, 0.0)
     ),
     r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$": lambda: MovingBase(
         (0, 0, 0, 2, 0, 0, 0)
     ),
-    rf"^flange_from_base is \[nan.*\]; {SEVEN}": lambda: soft_tip(FixedBase(), flange_from_base=[np.nan] * 7),
+    r"^flange_from_base holds a value that is not finite: \[nan.*\]; give position": lambda: soft_tip(
+        FixedBase(), flange_from_base=[np.nan] * 7
+    ),
     (
-        r"^q has shape \(6,\); it must be \(9,\): 3 of the base, then extension and "
+        r"^q has shape \(6,\); it must be \(9,\), 3 of the base, then extension and "
         r"two displacements for each of 2 segments \[m\]\.$"
     ): lambda: soft_tip(MovingBase()).place([0.0] * 6),
-    r"^q holds a value that is not finite: \[nan nan nan nan nan nan\]\.$": lambda: soft_tip(
-        FixedBase()
-    ).place([np.nan] * 6),
-    r"^q is 'here'; give 6 numbers\.$": lambda: soft_tip(FixedBase()).place("here"),
-    rf"^base_pose is \[0\.0\]; {SEVEN}": lambda: soft_tip(FixedBase()).place(ACTION, base_pose=[0.0]),
+    r"^q holds a value that is not finite: \[nan, nan, nan, nan, nan, nan\]; give 0 of the base": lambda: (
+        soft_tip(FixedBase()).place([np.nan] * 6)
+    ),
+    r"^q is not an array of numbers; give \(6,\), 0 of the base": lambda: soft_tip(FixedBase()).place("here"),
+    r"^base_pose has shape \(1,\); it must be \(7,\), position": lambda: soft_tip(FixedBase()).place(
+        ACTION, base_pose=[0.0]
+    ),
     r"^position needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).position,
     r"^jacobian needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).jacobian(),
     r"^largest_bend is 0\.0 rad; it must be a number, positive and finite\.$": lambda: soft_tip(

@@ -354,17 +354,21 @@ NOT_THERE = {
     "no joint positions within the limits .* is 1.05 m off": lambda a: a.solve((2.0, 0.0, 0.0), np.zeros(6)),
 }
 BAD_INPUT = {
-    "arm's base is at": lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, position=(0.0, 1.0)),
-    "base pose's quaternion": lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, quaternion=(0, 0, 0, 2)),
-    "q is .*give 6 finite numbers": lambda a: a.frame(np.zeros(5)),
-    "q is 'home'; give 6 finite numbers": lambda a: a.frame("home"),
-    "q is .*nan.*give 6 finite numbers": lambda a: a.jacobian(np.full(6, np.nan)),
+    r"position has shape \(2,\); it must be \(3,\), of the arm's": lambda a: BulletArm.load(
+        a.bullet, ur5_path(), tip=0, position=(0.0, 1.0)
+    ),
+    "the arm's base has a quaternion of norm 2": lambda a: BulletArm.load(
+        a.bullet, ur5_path(), tip=0, quaternion=(0, 0, 0, 2)
+    ),
+    r"q has shape \(5,\); it must be \(6,\), a number for each of sh": lambda a: a.frame(np.zeros(5)),
+    r"q is not an array of numbers; give \(6,\)": lambda a: a.frame("home"),
+    r"q holds a value that is not finite: \[nan": lambda a: a.jacobian(np.full(6, np.nan)),
     "q of elbow_joint is 4; its limits": lambda a: a.drive([0, 0, 4.0, 0, 0, 0]),
     ".*q of elbow_joint is 4; its limits": lambda a: a.place([0, 0, 4.0, 0, 0, 0]),
-    "q_dot is": lambda a: a.drive(np.zeros(6), np.zeros(2)),
-    ".*q_dot is": lambda a: a.place(np.zeros(6), np.zeros(2)),
-    r"target is .*position \(3,\) or": lambda a: a.solve(np.zeros(4), np.zeros(6)),
-    "quaternion .* has norm 2": lambda a: a.solve((0.3, 0.2, 0.3, 2, 0, 0, 0), np.zeros(6)),
+    "q_dot has shape": lambda a: a.drive(np.zeros(6), np.zeros(2)),
+    ".*q_dot has shape": lambda a: a.place(np.zeros(6), np.zeros(2)),
+    r"target has shape \(4,\); it must be \(3,\) or \(7,\)": lambda a: a.solve(np.zeros(4), np.zeros(6)),
+    "quaternion of norm 2": lambda a: a.solve((0.3, 0.2, 0.3, 2, 0, 0, 0), np.zeros(6)),
 }
 
 

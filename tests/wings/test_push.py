@@ -1,5 +1,6 @@
 """A rod on a host pushes bodies of its world, and both feel it."""
 
+import mujoco
 import numpy as np
 import pytest
 from bullets import carrier, clearance_of, cube, empty_world, soft_robot
@@ -8,6 +9,7 @@ from fastrod.contact import ContactScene, plane
 from fastrod.errors import HostError, InputError, UnknownNameError
 from fastrod.hosts import MountedRod
 from fastrod.hosts.mounted import BulletBodyContact
+from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
 from fastrod.simulator import Simulator
 
 
@@ -48,10 +50,49 @@ def test_what_cannot_be_touched_is_a_sentence():
         BulletBodyContact(world, ghost, dt=0.005, friction=0.3)
     wall = plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")
     sim = Simulator(soft_robot(), contact=ContactScene(obstacles=[wall]))
-    with pytest.raises(InputError, match=r"the mobility of 'wall' is .*; give \[m/N\], \(3, 3\)"):
-        sim.set_free("wall", -1.0, np.eye(3), np.zeros(3))
+    with pytest.raises(InputError, match=r"mobility of 'wall' has shape \(3,\); it must be \(6, 6\)"):
+        sim.set_free("wall", np.zeros(3), np.zeros(3))
+    with pytest.raises(InputError, match=r"mobility of 'wall' is not symmetric with eigenvalues"):
+        sim.set_free("wall", -np.eye(6), np.zeros(3))
+    with pytest.raises(InputError, match=r"center of 'wall' has shape \(2,\); it must be \(3,\)"):
+        sim.set_free("wall", np.eye(6), np.zeros(2))
     with pytest.raises(UnknownNameError, match=r"no obstacle 'wal'; did you mean 'wall'\?"):
-        sim.set_free("wal", 1.0, np.eye(3), np.zeros(3))
+        sim.set_free("wal", np.eye(6), np.zeros(3))
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_what_falls_is_expected_where_it_falls_and_what_lies_where_it_lies(engine):
+    dt, gravity = 0.005, np.array([0.0, 0.0, -9.81])
+    if engine == "pybullet":
+        world = empty_world(dt, 9.81)
+        world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_PLANE))
+        contact = BulletBodyContact(world, cube(world, 0.04, 0.1, [0.0, 0.0, 0.1]), dt=dt, friction=0.3)
+        step = world.stepSimulation
+    else:
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option timestep="{dt}"/><worldbody><geom type="plane" size="1 1 1"/><body name="cube" '
+            'pos="0 0 .1"><freejoint/><geom type="box" size=".02 .02 .02" mass=".1"/></body></worldbody>'
+            "</mujoco>"
+        )
+        data = mujoco.MjData(model)
+        contact = MujocoBodyContact(model, data, model.body("cube").id, dt=dt, friction=0.3)
+
+        def step():
+            mujoco.mj_step(model, data)
+            mujoco.mj_forward(model, data)
+
+        mujoco.mj_forward(model, data)
+    missed, height = [], []
+    for _ in range(200):
+        expected = contact.expected([], gravity)[0][contact.names[0]]
+        step()
+        contact.end()
+        missed.append(abs(contact.com().pose - expected).max())
+        height.append(contact.com().pose[2])
+    assert height[20] > 0.03
+    assert max(missed[1:20]) < 1e-9  # in the first step it is not known that it falls
+    assert height[-1] == pytest.approx(0.02, abs=1e-3)
+    assert max(missed[-50:]) < 1e-5
 
 
 def test_rod_can_be_taken_out_of_the_world():

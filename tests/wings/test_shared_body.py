@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fastrod.hosts import BulletLink, MountedRod, MujocoBody, MujocoRod, add_capsules
 
+BOTH = ("pybullet", "mujoco")
 TWIST = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0])
 ROD = soft_robot(line_density=0.2)  # 0.04 kg
 HOME = np.array(ROD.rest_tendon_length)
@@ -180,3 +181,74 @@ def test_what_they_grasp_adds_nothing_to_the_momentum_of_their_hand(line_density
         force = max(force, min(np.linalg.norm(rod.body_contacts[0].exerted[:3]) for rod in rods))
     assert force > 0.05
     assert fastest < 0.05
+
+
+class Grasp:
+    """Two rods that hang from posts, and a cube of 60 mm between their tips."""
+
+    def __init__(self, engine, dt, mass, **segment):
+        robot, half = soft_robot(**segment), 0.03
+        self.home, self.dt, ends = np.array(robot.rest_tendon_length), dt, [-half - 0.016, half + 0.016]
+        if engine == "pybullet":
+            self.world = world = empty_world(dt)
+            thing = cube(world, 2.0 * half, mass, [0.0, 0.0, -0.215])
+            posts = (
+                BulletLink(world, world.createMultiBody(0.0, -1, -1, [x, 0, 0]), quaternion=(0, 1, 0, 0))
+                for x in ends
+            )
+            self.rods = [MountedRod(robot, post, contact_bodies=[thing], friction=1.0) for post in posts]
+            self.step, self.place = (
+                world.stepSimulation,
+                lambda: world.getBasePositionAndOrientation(thing)[0],
+            )
+            self.fall = lambda: world.setGravity(0.0, 0.0, -9.81)
+            return
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.option.gravity = dt, [0.0] * 3
+        thing = spec.worldbody.add_body(name="thing", pos=[0.0, 0.0, -0.215])
+        thing.add_freejoint()
+        thing.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3, mass=mass)
+        for x in ends:
+            post = spec.worldbody.add_body(name=f"post {x}", pos=[x, 0.0, 0.0], quat=[0, 1, 0, 0])
+            add_capsules(spec, robot, post.name, name=f"rod {x}", contact_bodies=["thing"])
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        touch = {"contact_bodies": ["thing"], "friction": 1.0}
+        self.rods = [MujocoRod(robot, model, data, f"post {x}", name=f"rod {x}", **touch) for x in ends]
+        self.step, self.place = lambda: mujoco.mj_step(model, data), lambda: data.body("thing").xpos.copy()
+        self.fall = lambda: model.opt.gravity.__setitem__(2, -9.81)
+
+    def go(self, seconds, pull):
+        """Steps in which tendons go from one `pull` to another."""
+        for x in np.linspace(*pull, round(seconds / self.dt)):
+            change = x * np.resize([-1.0, 0.0, 1.0, 0.0], len(self.home))
+            for rod, sign in zip(self.rods, (-1.0, 1.0), strict=True):
+                assert rod.begin(tendon_length=self.home - sign * change).ok[0]
+            self.step()
+            for rod in self.rods:
+                rod.end()
+
+    @property
+    def force(self):
+        return np.array([rod.body_contacts[0].exerted[:3] for rod in self.rods])
+
+
+@pytest.mark.parametrize("engine", BOTH)
+@pytest.mark.parametrize("segment", [{}, {"line_density": 0.05, "damping_time": 0.02}])
+@pytest.mark.study
+def test_two_rods_hold_a_cube_between_them_in_steps_of_any_length(engine, segment):
+    mass, grips = 0.05, []
+    for dt in (0.01, 0.005, 0.0025):
+        grasp = Grasp(engine, dt, mass, **segment)
+        for rod in grasp.rods:
+            rod.settle()
+        grasp.go(0.4, (0.0, 0.0024))
+        grasp.go(0.4, (0.0024, 0.0024))
+        grips.append(grasp.force[:, 0])
+        grasp.fall()
+        began = grasp.place()
+        grasp.go(0.4, (0.0024, 0.0024))
+        assert_allclose(grasp.force.sum(0), [0.0, 0.0, 9.81 * mass], atol=0.01 * mass * 9.81)
+        assert np.abs(np.subtract(grasp.place(), began)).max() < 0.2 * dt  # it falls within the first step
+    assert_allclose(grips, np.tile(grips[-1], (3, 1)), rtol=2e-3)
+    assert_allclose(grips[-1].sum(), 0.0, atol=1e-3 * grips[-1][0])

@@ -141,7 +141,7 @@ def measure(
 @inline
 def compliant(k: int, surfaces: Surfaces) -> bool:
     """A rod may be deep in obstacle k: it is soft, or free to move."""
-    return bool(surfaces.compliance[k] > 0.0 or surfaces.mobility[k, 0] > 0.0)
+    return bool(surfaces.compliance[k] > 0.0 or surfaces.mobility[k, 0, 0] > 0.0)
 
 
 @kernel

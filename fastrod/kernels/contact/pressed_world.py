@@ -1,8 +1,7 @@
 """One world of rods of modes that touch, gathered for a Newton step: the Hessian and gradient of its
 unknowns, and of every contact its axes, its gap and slip, and how they change with the unknowns.
 
-To a rod's unknowns belong those of a free body that it touches, its displacement within the step and the
-moment on it: six more.
+To a rod's unknowns belong those of a free body that it touches, the force on it and the moment: six more.
 """
 
 from __future__ import annotations
@@ -324,19 +323,19 @@ def _add_arm_stiffness(row: int, n_q: int, spin: Floats, arm: Vec, rubs: Vec, pr
 
 
 @kernel
-def _add_body(m: int, at: int, mobility: Numbers, place: Vec, pressing: PressedWorld) -> None:
-    """Take the motion of a free body there from that of contact m: displacement, and rotation by the moment
-    on it, unknowns `at` on."""
-    arm = sub(place, (mobility[10], mobility[11], mobility[12]))
+def _add_body(m: int, at: int, k: int, place: Vec, surfaces: Surfaces, pressing: PressedWorld) -> None:
+    """Take the motion of the free body of obstacle k there, by the force and the moment on it, from that of
+    contact m: unknowns `at` on."""
+    mobility, center = surfaces.mobility[k], surfaces.center[k]
+    arm = sub(place, (center[0], center[1], center[2]))
     for r in range(3):
         axis = _axis(pressing.axes[m], r)
         turned = cross(arm, axis)
-        for a in range(3):
-            pressing.along[m, r, at + a] -= axis[a]
-            by_moment = (
-                mobility[1 + a] * turned[0] + mobility[4 + a] * turned[1] + mobility[7 + a] * turned[2]
-            )
-            pressing.along[m, r, at + 3 + a] -= by_moment
+        for a in range(6):
+            moved = 0.0
+            for b in range(3):
+                moved += mobility[b, a] * axis[b] + mobility[3 + b, a] * turned[b]
+            pressing.along[m, r, at + a] -= moved
 
 
 @kernel
@@ -364,7 +363,7 @@ def gather_world(
     n_obstacles, n, m = len(surfaces.primitive), (last - first) * all_of_it.gradient.shape[1], 0
     most = n
     for k in range(n_obstacles):
-        most = n + 6 * n_obstacles if surfaces.mobility[k, 0] > 0.0 else most
+        most = n + 6 * n_obstacles if surfaces.mobility[k, 0, 0] > 0.0 else most
     for a in range(most):
         pressing.gradient[a] = 0.0
         for b in range(most):
@@ -420,10 +419,10 @@ def gather_world(
             _add_motion(m, o, i, q, 1.0, all_of_it, pressing)
             if other >= 0:
                 _add_motion(m, row, other, partner, -1.0, all_of_it, pressing)
-            elif surfaces.mobility[k, 0] > 0.0:
+            elif surfaces.mobility[k, 0, 0] > 0.0:
                 at = n + 6 * _body_of(k, surfaces)
                 place = _place(i, contact.arclength, all_of_it.motion)
-                _add_body(m, at, surfaces.mobility[k], axpy(-contact.radius, n_axis, place), pressing)
+                _add_body(m, at, k, axpy(-contact.radius, n_axis, place), surfaces, pressing)
             for a in range(most):
                 pressing.shift[m, 0, a], pressing.shift[m, 1, a] = 0.0, 0.0
             _let_slide(m, (o, row), i, q, other, partner, most, all_of_it, pressing)
@@ -442,11 +441,11 @@ def gather_world(
             m += 1
     for k in range(n_obstacles if most > n else 0):
         mobility, at = surfaces.mobility[k], n + 6 * _body_of(k, surfaces)
-        if mobility[0] > 0.0:
-            for a in range(3):
-                pressing.hessian[at + a, at + a] = 1.0 / (mobility[0] * all_of_it.yielding)
-                for b in range(3):
-                    pressing.hessian[at + 3 + a, at + 3 + b] = mobility[1 + 3 * a + b] / all_of_it.yielding
+        if mobility[0, 0] > 0.0:
+            for a in range(6):
+                pressing.gradient[at + a] = surfaces.ahead[k, a]
+                for b in range(6):
+                    pressing.hessian[at + a, at + b] = mobility[a, b] / all_of_it.yielding
     for a in range(n, most):
         if pressing.hessian[a, a] == 0.0:  # what cannot move
             pressing.hessian[a, a] = 1.0
