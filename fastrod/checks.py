@@ -116,8 +116,7 @@ def checked_array(name: str, value: ArrayLike, shapes: Sequence[tuple[int, ...]]
     if found.shape not in shapes:
         raise InputError(f"{name} has shape {found.shape}; it must be {wanted}, {says}.")
     if not np.isfinite(found).all():
-        some = found.ravel()[:14].tolist()
-        raise InputError(f"{name} holds a value that is not finite: {some}; give {says}.")
+        raise InputError(f"{name} holds a value that is not finite: {found.ravel()[:14].tolist()}.")
     return found
 
 

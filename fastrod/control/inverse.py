@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import checked_array
 from fastrod.effects.base import Seam, get_effect
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError
@@ -195,12 +196,7 @@ class _Drive:
         n = self.robot.n_tendons
         if start is None:
             return np.zeros(len(self.low))
-        try:
-            dl = np.asarray(start, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"start is {start!r}; give {n} changes of tendon length [m].") from error
-        if dl.shape != (n,) or not np.isfinite(dl).all():
-            raise InputError(f"start is {start!r}; give {n} changes of tendon length, finite [m].")
+        dl = checked_array("start", start, [(n,)], "one change of each tendon's length [m]")
         q: Floats = np.asarray(np.linalg.lstsq(self.matrix[:n], dl, rcond=None)[0], dtype=np.float64)
         left = np.abs(self.matrix[:n] @ q - dl).max()
         if left > 1e-5:

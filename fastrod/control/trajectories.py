@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import Bound, check_number
+from fastrod.checks import Bound, check_number, checked_array
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.types import Floats
 
@@ -37,14 +37,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         check_number(f"period of {self.name}", self.period, Bound(above=0.0, unit="s"))
-        try:
-            center = np.asarray(self.center, dtype=np.float64)
-        except (TypeError, ValueError):
-            center = np.empty(0)
-        if center.shape != (3,) or not np.isfinite(center).all():
-            raise InputError(
-                f"center of {self.name} is {self.center!r}; give three finite numbers, world [m]."
-            )
+        center = checked_array(f"center of {self.name}", self.center, [(3,)], "world [m]")
         object.__setattr__(self, "center", tuple(center.tolist()))
 
     def position(self, t: ArrayLike) -> Floats:

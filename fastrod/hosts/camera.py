@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fastrod.checks import Bound, check
+from fastrod.checks import Bound, check, checked_array
 from fastrod.errors import InputError
 from fastrod.hosts.bullet import Bullet
 from fastrod.types import Floats
@@ -88,16 +88,10 @@ class HostCamera:
 
 def _checked(*given: ArrayLike) -> list[list[float]]:
     """Eye, target and up as PyBullet takes them."""
-    vectors = []
-    for name, value in zip(("eye", "target", "up"), given, strict=True):
-        try:
-            v = np.asarray(value, float)
-        except (TypeError, ValueError):
-            v = np.empty(0)
-        if v.shape != (3,) or not np.isfinite(v).all():
-            raise InputError(f"the camera's {name} is {value!r}; give three finite numbers, world frame.")
-        vectors.append(v)
-    eye, target, up = vectors
+    eye, target, up = vectors = [
+        checked_array(f"the camera's {name}", value, [(3,)], "world [m]")
+        for name, value in zip(("eye", "target", "up"), given, strict=True)
+    ]
     sight = target - eye
     if not np.linalg.norm(np.cross(sight, up)) > 1e-9 * np.linalg.norm(sight) * np.linalg.norm(up):
         raise InputError(

@@ -7,6 +7,7 @@ import os
 import sys
 import weakref
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, final
@@ -27,8 +28,10 @@ from fastrod.types import Floats
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
 _HELD = 1e-9  # of the mobility of a base: one whose motion is given
 _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
-_RODS: weakref.WeakValueDictionary[int, CarriedRod] = weakref.WeakValueDictionary()
-"""All of this process; those on one body find each other here."""
+_RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
+    weakref.WeakValueDictionary
+)
+"""All of one world, by its number; those on one body, or at one, find each other here."""
 
 
 class _Begun(NamedTuple):
@@ -65,7 +68,7 @@ class CarriedRod(ABC):
     rod: Rod
     """The rod itself, without the engine."""
 
-    def __init__(self, host: Host, dt: float) -> None:
+    def __init__(self, host: Host, dt: float, world: int) -> None:
         self._host, self.dt = host, dt
         self.state: State | None = None
         """After the last step."""
@@ -73,7 +76,8 @@ class CarriedRod(ABC):
         """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
         self._begun: _Begun | None = None
         self.body_contacts = ()
-        _RODS[id(self)] = self
+        self._every = _RODS[world]
+        self._every[id(self)] = self
 
     @abstractmethod
     def _look(self) -> None:
@@ -209,8 +213,8 @@ class CarriedRod(ABC):
         return state
 
     def _others(self) -> list[CarriedRod]:
-        """All other rods of this process."""
-        return [rod for ref in _RODS.valuerefs() if (rod := ref()) and rod is not self]
+        """All other rods of this world."""
+        return [rod for ref in self._every.valuerefs() if (rod := ref()) and rod is not self]
 
     def _stiffness(self) -> tuple[Floats, Floats]:
         """(6, 6) by how much the rod's wrench falls by more motion of its base in the step that it has begun,

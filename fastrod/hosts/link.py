@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import HostError
+from fastrod.checks import checked_array, checked_pose
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.host import Freedom, Host, Motion, inverse_inertia
 from fastrod.rotation import cross, matrix_from_quaternion, product
@@ -43,7 +43,7 @@ class BulletLink:
         quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     ) -> None:
         """`link`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, link_from_base. Raises
-        `HostError`."""
+        `HostError`, `InputError`."""
         self.bullet = Bullet(bullet)
         self.body = body
         self.link = self.bullet.link_named(body, link) if isinstance(link, str) else int(link)
@@ -164,15 +164,7 @@ def exert(bullet: Bullet, body: int, link: int, wrench: Floats, point: Floats) -
 
 
 def mount_pose(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floats]:
-    """Position (3,) [m] and quaternion (4,) w x y z of a mount; `HostError` for what is none."""
-    p, q = np.asarray(position, float), np.asarray(quaternion, float)
-    if p.shape != (3,) or q.shape != (4,) or not np.isfinite([*p, *q]).all():
-        raise HostError(
-            f"the mount is {position!r}, {quaternion!r}; give a position (3,) [m] and a "
-            "quaternion (4,) w x y z."
-        )
-    if abs((norm := float(np.linalg.norm(q))) - 1.0) > 1e-6:
-        raise HostError(
-            f"the mount's quaternion {list(map(float, q))!r} has norm {norm:.6g}; it must be 1, as w x y z."
-        )
-    return p, q
+    """Position (3,) [m] and quaternion (4,) w x y z of a mount; `InputError` for what is none."""
+    place = checked_array("position", position, [(3,)], "of the mount [m]")
+    turned = checked_array("quaternion", quaternion, [(4,)], "of the mount, w x y z")
+    return place, checked_pose("the mount", np.concatenate([place, turned]))[3:]

@@ -124,7 +124,7 @@ class MountedRod(CarriedRod):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
             )
-        super().__init__(host, host.bullet.dt)
+        super().__init__(host, host.bullet.dt, host.bullet.number)
         self.host, self.bullet = host, host.bullet
         check_robot(robot)
         check_gravity(robot, self._gravity(), "setGravity() in the world")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import NOT_NEGATIVE, check_number
+from fastrod.checks import NOT_NEGATIVE, check_number, checked_array
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.carried import CarriedRod, check_bodies, check_gravity, rod_of
@@ -174,7 +174,7 @@ class MujocoRod(CarriedRod):
         model's. Raises `HostError`, `InputError`, `RobotError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
-        super().__init__(host, float(model.opt.timestep))
+        super().__init__(host, float(model.opt.timestep), id(data))
         self.host, self.model, self.data = host, model, data
         check_gravity(robot, self._gravity(), "set model.opt.gravity")
         check_number("friction", friction, NOT_NEGATIVE)
@@ -285,13 +285,8 @@ def _tree(body: Any) -> Iterator[Any]:
 
 
 def _rgba(name: str, value: Sequence[float]) -> list[float]:
-    try:
-        rgba = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        rgba = np.empty(0)
-    if rgba.shape != (4,) or not np.isfinite(rgba).all():
-        raise InputError(f"{name} is {value!r}; give red, green, blue and opacity, four numbers from 0 to 1.")
-    return [float(component) for component in rgba]
+    found: list[float] = checked_array(name, value, [(4,)], "red, green, blue, opacity, from 0 to 1").tolist()
+    return found
 
 
 def _sizes(robot: Robot, per_segment: int) -> tuple[Floats, Floats]:

@@ -129,7 +129,7 @@ class MujocoBody:
         quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     ) -> None:
         """`body`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base. Raises
-        `HostError`."""
+        `HostError`, `InputError`."""
         check_world(model, data)
         self.model, self.data = model, data
         self.body = body_number(model, body)

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError
+from fastrod.checks import checked_array
 from fastrod.logs.link import Measurement
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
@@ -62,10 +62,10 @@ class SimulatedRobot:
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
         """Move at once to these changes of length (`RobotLink.command`). Raises `InputError` on wrong shapes
         and on what is not finite."""
-        change = _numbers("dl", dl, self._robot.n_tendons)
-        extension = (
-            np.zeros(self._robot.n_segments) if ext is None else _numbers("ext", ext, self._robot.n_segments)
-        )
+        robot = self._robot
+        change = checked_array("dl", dl, [(robot.n_tendons,)], "one change of each tendon's length [m]")
+        ext = np.zeros(robot.n_segments) if ext is None else ext
+        extension = checked_array("ext", ext, [(robot.n_segments,)], "one extension of each segment [m]")
         with self._lock:
             if not self.stopped:
                 self._change, self._extension = change, extension
@@ -104,13 +104,3 @@ class SimulatedRobot:
     def close(self) -> None:
         """Stop."""
         self.stop()
-
-
-def _numbers(name: str, values: ArrayLike, n: int) -> Floats:
-    try:
-        found = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; give {n} numbers [m].") from error
-    if found.shape != (n,) or not np.isfinite(found).all():
-        raise InputError(f"{name} is {values!r}; give {n} finite numbers [m], one each.")
-    return found

@@ -212,7 +212,7 @@ def test_more_rollouts_are_never_worse() -> None:
         ({"limit": np.nan}, "limit is nan m"),
         ({"gain": "much"}, "gain is 'much'; it must be"),
         ({"rollouts": 0}, "rollouts is 0; it must be a whole number"),
-        ({"start": [0.001, 0.0]}, "give 4 changes of tendon length"),
+        ({"start": [0.001, 0.0]}, r"start has shape \(2,\); it must be \(4,\), one change"),
         ({"start": [0.001, 0.0, 0.001, 0.0]}, "pull one tendon as far as its opposite gives"),
         ({"start": [-0.01, 0.0, 0.01, 0.0], "limit": 0.005}, "within the limits"),
         (

@@ -175,16 +175,14 @@ BAD_INPUT = {
     r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$": lambda: MovingBase(
         (0, 0, 0, 2, 0, 0, 0)
     ),
-    r"^flange_from_base holds a value that is not finite: \[nan.*\]; give position": lambda: soft_tip(
+    r"^flange_from_base holds a value that is not finite: \[nan.*\]\.$": lambda: soft_tip(
         FixedBase(), flange_from_base=[np.nan] * 7
     ),
     (
         r"^q has shape \(6,\); it must be \(9,\), 3 of the base, then extension and "
         r"two displacements for each of 2 segments \[m\]\.$"
     ): lambda: soft_tip(MovingBase()).place([0.0] * 6),
-    r"^q holds a value that is not finite: \[nan, nan, nan, nan, nan, nan\]; give 0 of the base": lambda: (
-        soft_tip(FixedBase()).place([np.nan] * 6)
-    ),
+    r"^q holds a value that is not finite: \[nan.*\]\.$": lambda: soft_tip(FixedBase()).place([np.nan] * 6),
     r"^q is not an array of numbers; give \(6,\), 0 of the base": lambda: soft_tip(FixedBase()).place("here"),
     r"^base_pose has shape \(1,\); it must be \(7,\), position": lambda: soft_tip(FixedBase()).place(
         ACTION, base_pose=[0.0]

@@ -105,9 +105,7 @@ REFUSED = {
         f"radius of circle is nan m; {MUST}": lambda: circle(radius=np.nan),
         f"pitch of helix is 0.0 m; {MUST}": lambda: helix(pitch=0.0),
         f"period of figure_eight is 'long' s; {MUST}": lambda: figure_eight(period="long"),
-        "center of circle is (0.0, 1.0); give three finite numbers, world [m].": lambda: circle(
-            center=(0.0, 1.0)
-        ),
+        "center of circle has shape (2,); it must be (3,), world [m].": lambda: circle(center=(0.0, 1.0)),
         "t holds a time that is not finite; give times [s].": lambda: circle().position(np.inf),
         "t is 'now'; give times [s], a number or an array of them.": lambda: circle().velocity("now"),
     },

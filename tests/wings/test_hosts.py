@@ -217,7 +217,6 @@ NOT_THERE = {
     r"this PyBullet world has no body 7; it has \[0\]\.": lambda w: (kuka(w, 0), BulletLink(w, 7)),
     r"body 0 has no link 9; -1 is its base, links are numbered from 0 to 6\.": on(9),
     r"body 0 has no link 'lbr_iiwa_link_8'; did you mean 'lbr_iiwa_link_7'\?": on("lbr_iiwa_link_8"),
-    r"quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": on(quaternion=(1, 1, 0, 0)),
     r"body \d+ has no link 2; -1 is its base, it has no others\.": lambda w: BulletLink(
         w, carrier(w).body, 2
     ),
@@ -227,6 +226,7 @@ NOT_THERE = {
     r"^host is 3; give BulletLink\(world, body, link\)": lambda w: MountedRod(soft_robot(), 3),
 }
 BAD_INPUT = {
+    r"the mount has a quaternion of norm 1.41421; it must be 1": on(quaternion=(1, 1, 0, 0)),
     r"3 capsules for 10 points of a segment; give a divisor of the points\.": mounted(capsules_per_segment=3),
     r"friction is -1; it must be a number, zero or positive and finite\.": mounted(friction=-1),
     r"^gravity is 9.81; give three numbers": lambda w: connect(gravity=9.81),

@@ -286,7 +286,7 @@ def test_a_measured_robot_that_differs_shows_its_residual() -> None:
 
 def test_a_simulated_robot_refuses_what_it_cannot_do() -> None:
     link = SimulatedRobot(fastrod.load_robot("prototype"))
-    with pytest.raises(InputError, match=r"dl is \[0.0\]; give 4 finite numbers"):
+    with pytest.raises(InputError, match=r"dl has shape \(1,\); it must be \(4,\)"):
         link.command([0.0])
     with pytest.raises(InputError, match="finite"):
         link.command([np.nan, 0.0, 0.0, 0.0])

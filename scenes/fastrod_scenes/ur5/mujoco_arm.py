@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError
+from fastrod.checks import checked_array
 from fastrod.hosts.mujoco_body import mujoco
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
@@ -75,7 +75,4 @@ class MujocoArm:
 
 
 def _joints(q: ArrayLike) -> Floats:
-    joints = np.asarray(q, dtype=float)
-    if joints.shape != (6,) or not np.isfinite(joints).all():
-        raise InputError(f"q is {q!r}; give 6 finite numbers, one for each of {', '.join(JOINTS)} [rad].")
-    return joints
+    return checked_array("q", q, [(6,)], f"one angle for each of {', '.join(JOINTS)} [rad]")
