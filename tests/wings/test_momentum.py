@@ -218,7 +218,7 @@ def test_rods_of_a_batch_give_way_each_by_itself() -> None:
 def test_wrong_inverse_inertia_is_a_sentence() -> None:
     rod = Rod(heavy(0.1), dynamics=True)
     for given, sentence in {
-        "x": r"^inverse_inertia has shape \(0,\); give \(6, 6\)",
+        "x": r"^inverse_inertia is not an array of numbers; give \(6, 6\)",
         "skew": r"^inverse_inertia is not symmetric",
     }.items():
         matrix: Any = given if given == "x" else np.triu(np.ones((6, 6)))
