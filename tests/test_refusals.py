@@ -462,7 +462,7 @@ OTHERS: Rows = [
     (lambda: recorder().add(reading(math.inf)), "the reading has t = inf; a row needs a finite time"),
     (
         lambda: reference.constant_curvature(rod(), [0.07]),
-        r"tendon_length has shape \(1,\); it must be \(4,\) finite lengths",
+        r"tendon_length has shape \(1,\); it must be \(4,\), one length",
     ),
     (lambda: reference.shoot(slack(), tension=[-1.0]), "a unilateral tendon cannot push"),
     (lambda: reference.shoot(rod(), REST, point_force=[(0.01,)]), "each entry must be a pair of arclength"),

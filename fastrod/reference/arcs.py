@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError
+from fastrod.checks import checked_array
 from fastrod.model.robot import Robot
 from fastrod.reference.inputs import segment_length, tendon_offset
 from fastrod.reference.rod import (
@@ -53,11 +53,7 @@ def constant_curvature(
     2024, eq. 2b (curvature of the segment base from the tendon lengths), one arc a segment. Raises
     `InputError` on wrong shapes and ranges.
     """
-    length = np.asarray(tendon_length, dtype=np.float64)
-    if length.shape != (robot.n_tendons,) or not np.all(np.isfinite(length)):
-        raise InputError(
-            f"tendon_length has shape {length.shape}; it must be ({robot.n_tendons},) finite lengths [m]."
-        )
+    length = checked_array("tendon_length", tendon_length, [(robot.n_tendons,)], "one length a tendon [m]")
     backbone = segment_length(robot, extension)
     u = curvature_of_length(
         robot, backbone, length, np.array([segment.precurvature for segment in robot.segments])

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fastrod.checks import checked_array
 from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.reference.rod import Array, RodProblem, Span
@@ -73,12 +74,7 @@ def segment_length(robot: Robot, extension: ArrayLike | None) -> Array:
     rest = np.array([segment.length for segment in robot.segments])
     if extension is None:
         return rest
-    change = _array("extension", extension)
-    if change.shape != rest.shape:
-        raise InputError(
-            f"extension has shape {change.shape}; it must be ({robot.n_segments},), one change "
-            "of length a segment [m]."
-        )
+    change = checked_array("extension", extension, [rest.shape], "one change of length a segment [m]")
     for k, (segment, value) in enumerate(zip(robot.segments, change, strict=True), 1):
         low, high = segment.extension
         if not low <= value <= high:
@@ -177,10 +173,7 @@ def _array(name: str, value: ArrayLike, needed: NDArray[np.bool_] | None = None)
 
 
 def _vector(name: str, value: ArrayLike | None, unit: str) -> Array:
-    array = np.zeros(3) if value is None else _array(name, value)
-    if array.shape != (3,):
-        raise InputError(f"{name} has shape {array.shape}; it must be (3,) [{unit}].")
-    return array
+    return np.zeros(3) if value is None else checked_array(name, value, [(3,)], f"a vector [{unit}]")
 
 
 def _per_tendon(name: str, value: ArrayLike | None, needed: NDArray[np.bool_], unit: str) -> Array:

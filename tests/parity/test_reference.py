@@ -305,7 +305,7 @@ LENGTHS = {"tendon_length": [0.07] * 4}
         (LENGTHS | {"extension": [0.0, 0.0]}, "extension has shape"),
         (LENGTHS | {"method": "slsp"}, "did you mean 'slsqp'"),
         (LENGTHS | {"integrator": "RK54"}, "did you mean 'RK45'"),
-        (LENGTHS | {"tip_force": "up"}, "must be numbers"),
+        (LENGTHS | {"tip_force": "up"}, "tip_force is not an array of numbers"),
     ],
 )
 def test_wrong_inputs_are_reported(inputs: dict[str, Any], sentence: str) -> None:
