@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from fuzz_seeds import KINDS, Originals, write_case, write_fine
 
-SECONDS, BYTES = 10.0, 1_500_000_000
+SECONDS, BYTES = 10.0, 1_000_000_000
 """Largest cost of one file."""
 FINE = ("right", "refused")
 _HARM = ("traceback", "code run", "over time", "over memory", "died")
