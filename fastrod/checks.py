@@ -120,13 +120,13 @@ def checked_array(name: str, value: ArrayLike, shapes: Sequence[tuple[int, ...]]
     return found
 
 
-def checked_pose(name: str, value: ArrayLike, *rows: int) -> _Array:
+def checked_pose(name: str, value: ArrayLike, *rows: int, off: float = 1e-6) -> _Array:
     """(7,), or (n, 7) of one of these many `rows`: position [m] and quaternion w x y z, which is made unit;
-    its norm is 1 to 1e-3. Raises `InputError`."""
+    its norm is `off` 1 by no more. Raises `InputError`."""
     says = "position [m] and quaternion w x y z"
     pose = checked_array(name, value, [(7,), *((n, 7) for n in rows)], says)
     norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
-    if (beyond := np.abs(norm - 1.0)).max() > 1e-3:
+    if (beyond := np.abs(norm - 1.0)).max() > off:
         worst = norm.ravel()[beyond.argmax()]
         raise InputError(f"{name} has a quaternion of norm {worst:.6g}; it must be 1, as w x y z.")
     return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)

@@ -186,7 +186,7 @@ class ContactScene:
         unit."""
         for name, value in (given or {}).items():
             k = self.index(name)
-            pose = np.atleast_2d(checked_pose(f"obstacle_pose[{name!r}]", value, n_robots, 1))
+            pose = np.atleast_2d(checked_pose(f"obstacle_pose[{name!r}]", value, n_robots, 1, off=1e-3))
             poses = np.repeat(poses, len(pose), axis=0) if len(poses) < len(pose) else poses.copy()
             poses[:, k] = pose
         return poses

@@ -64,7 +64,7 @@ class BodyContact(ABC):
         self.number, self.dt = body, dt
         self.mass = mass
         """0: it does not move for the rod [kg]."""
-        self._inertia: Floats = np.maximum(inertia, 1e-12)
+        self._inertia = inertia
         self.shapes = [
             shape._replace(obstacle=dataclasses.replace(shape.obstacle, friction=friction))
             for shape in shapes
@@ -212,9 +212,9 @@ class BodyContact(ABC):
         """Fraction of a wrench that stops the body, at most all: while its rod was lost it went into it,
         against no force, and what the rod would give it is nobody's energy."""
         motion = self.com()
-        moment = matrix_from_quaternion(motion.pose[None, 3:])[0].T @ wrench[3:]
-        power = wrench[:3] @ wrench[:3] / max(self.mass, 1e-300) + moment @ (moment / self._inertia)
-        return float(min(1.0, max(-wrench @ motion.velocity, 0.0) / max(self.dt * power, 1e-300)))
+        gained: Floats = inverse_inertia(self.mass, self._inertia, motion.pose) @ wrench
+        against, power = -float(wrench @ motion.velocity), float(wrench @ gained)
+        return min(1.0, max(against, 0.0) / max(self.dt * power, 1e-300))
 
     def _begin_anew(self, even: bool = False) -> None:
         """Let the body feel the coming force alone; the last one was like the one before it, if `even`."""

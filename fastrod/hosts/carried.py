@@ -31,7 +31,7 @@ _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of
 _RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
     weakref.WeakValueDictionary
 )
-"""All of one world, by its number; those on one body, or at one, find each other here."""
+"""Rods of a world, by its number: those on one body, and those that touch one, find each other here."""
 
 
 class _Begun(NamedTuple):

@@ -490,7 +490,8 @@ class Rod:
         return Freedom(given, np.broadcast_to(twist, motion.velocity.shape))
 
     def _poses(self, base_pose: ArrayLike) -> Floats:
-        return checked_pose("base_pose", base_pose, *([] if self.n_robots is None else [self.n_robots]))
+        rows = [] if self.n_robots is None else [self.n_robots]
+        return checked_pose("base_pose", base_pose, *rows, off=1e-3)
 
     def _twists(self, base_twist: ArrayLike) -> Floats:
         shapes = [(6,)] if self.n_robots is None else [(6,), (self.n_robots, 6)]

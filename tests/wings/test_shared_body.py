@@ -237,18 +237,18 @@ class Grasp:
 @pytest.mark.parametrize("segment", [{}, {"line_density": 0.05, "damping_time": 0.02}])
 @pytest.mark.study
 def test_two_rods_hold_a_cube_between_them_in_steps_of_any_length(engine, segment):
-    mass, grips = 0.05, []
+    mass, forces = 0.05, []
     for dt in (0.01, 0.005, 0.0025):
         grasp = Grasp(engine, dt, mass, **segment)
         for rod in grasp.rods:
             rod.settle()
         grasp.go(0.4, (0.0, 0.0024))
         grasp.go(0.4, (0.0024, 0.0024))
-        grips.append(grasp.force[:, 0])
+        forces.append(grasp.force[:, 0])
         grasp.fall()
         began = grasp.place()
         grasp.go(0.4, (0.0024, 0.0024))
         assert_allclose(grasp.force.sum(0), [0.0, 0.0, 9.81 * mass], atol=0.01 * mass * 9.81)
         assert np.abs(np.subtract(grasp.place(), began)).max() < 0.2 * dt  # it falls within the first step
-    assert_allclose(grips, np.tile(grips[-1], (3, 1)), rtol=2e-3)
-    assert_allclose(grips[-1].sum(), 0.0, atol=1e-3 * grips[-1][0])
+    assert_allclose(forces, np.tile(forces[-1], (3, 1)), rtol=2e-3)
+    assert_allclose(forces[-1].sum(), 0.0, atol=1e-3 * forces[-1][0])
