@@ -195,19 +195,8 @@ class Simulator(RobotBatch):
         `derive` says that `jacobian(turning=True)` will be asked for: a robot or two without contact and
         effects then get it from the same pass, at the shape of the state, at little cost.
         """
-        given = Inputs(
-            tendon_length,
-            tension,
-            extension,
-            tip_force,
-            tip_moment,
-            line_force,
-            point_force,
-            follower_tip_force,
-            follower_line_force,
-            base_pose,
-            gravity,
-        )
+        more = line_force, point_force, follower_tip_force, follower_line_force
+        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, *more, base_pose, gravity)
         how = How(self.dt, passes, estimate_error, inverse_inertia, derive)
         self._rods.accept(given, how)
         return self._step(given, how, self._moved_obstacles(obstacle_pose, obstacle_velocity))
@@ -246,19 +235,8 @@ class Simulator(RobotBatch):
         check_number("tolerance", tolerance, Bound(above=0.0, unit="m"))
         if tendon_length is None and tension is None:
             tendon_length, tension = self._at_rest()
-        given = Inputs(
-            tendon_length,
-            tension,
-            extension,
-            tip_force,
-            tip_moment,
-            line_force,
-            point_force,
-            follower_tip_force,
-            follower_line_force,
-            base_pose,
-            gravity,
-        )
+        more = line_force, point_force, follower_tip_force, follower_line_force
+        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, *more, base_pose, gravity)
         self._rods.accept(given, None)
         if self._felt is not None and rows is not None:
             raise InputError(
@@ -463,6 +441,16 @@ class Simulator(RobotBatch):
         from fastrod.contact import queries
 
         return queries.clearance(self._contact("clearance"), self._full("clearance").as_shape(), obstacle)
+
+    def overlap(self, obstacle_pose: Mapping[str, ArrayLike]) -> Floats:
+        """(n_robots, n_obstacles, 3) shortest displacement of each obstacle out of each robot, mounting
+        excepted, world [m]: 0 where they are apart. Obstacles are at `obstacle_pose` (as for `step`), or else
+        where they are. Raises `InputError` as `clearance` and for poses that are none, `UnknownNameError`."""
+        from fastrod.contact import queries
+
+        engine, shape = self._contact("overlap"), self._full("overlap").as_shape()
+        poses = engine.scene.moved(engine.poses, obstacle_pose, self.n_robots)
+        return queries.overlap(engine, shape, poses)
 
     def tendon_bend(self) -> Floats:
         """(n_robots,) largest curvature of the rod times the offset of a tendon on the inside of the bend.

@@ -62,9 +62,6 @@ def clearance_of(contact):
     robot, name = soft_robot(1), contact.names[0]
     scene = ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0)
     sim = Simulator(robot, contact=scene)
-    where = {
-        "base_pose": (0.15, 0.1, 0.12, 1, 0, 0, 0),
-        "obstacle_pose": {name: contact.expected([], np.zeros(3))[0][name]},
-    }
+    where = {"base_pose": (0.15, 0.1, 0.12, 1, 0, 0, 0), "obstacle_pose": {name: contact.now()[name]}}
     state = sim.settle(robot.rest_tendon_length, **where)
     return sim.clearance()[0], state.position[0, [0, -1]]

@@ -31,7 +31,8 @@ class Contacts:
     normal: Floats
     """(n_robots, n, 3) unit, from the obstacle to the rod."""
     gap: Floats
-    """(n_robots, n) [m]; negative by the depth in a soft obstacle."""
+    """(n_robots, n) [m]; negative by the depth in a soft obstacle, and by how far a body that gives way
+    (`Simulator.set_free`) was pushed from the pose it was given."""
     force: Floats
     """(n_robots, n, 3) on the rod, friction included [N]."""
     arclength: Floats
@@ -40,7 +41,7 @@ class Contacts:
     """(n_robots, n_obstacles, 6) on each obstacle by each robot: force [N], moment about the obstacle's
     origin [N m], world; of a body that gives way the mean over the step."""
     clearance: Floats
-    """(n_robots,) smallest gap to anything; a lower bound where nothing is near [m]."""
+    """(n_robots,) smallest gap to anything, as `gap`; a lower bound where nothing is near [m]."""
     deep: Flags
     """(n_robots,) the centreline lies inside an obstacle: its surface was entered by more than the rod's
     radius."""

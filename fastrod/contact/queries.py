@@ -1,4 +1,4 @@
-"""Queries of the last state: clearance, clearance on the way to it, and rays of a distance sensor."""
+"""Queries of the last state: clearance, also on the way to it, overlap, and rays of a distance sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fastrod.errors import InputError, refuse_masked
 from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact_batch import cast_rays, search_gaps
-from fastrod.types import CANDIDATE, Flags, Floats, Ints, RodShape
+from fastrod.types import CANDIDATE, Flags, Floats, Ints, Records, RodShape
 
 _EVERYTHING = 1e6  # of the rod's length: a margin within which all is near
 _MOST_SPLITS = 400  # of the way between two states: a bound on time
@@ -35,12 +35,33 @@ def clearance(engine: Engine, shape: RodShape, name: str | None = None) -> Float
     or all obstacles and, where they may touch, rods [m]. Negative by the depth where they overlap; inf where
     there is nothing; nan where there is no shape.
     """
-    return _gap(engine, shape, engine.poses, None if name is None else engine.scene.index(name))
+    only = None if name is None else engine.scene.index(name)
+    return _search(engine, shape, engine.poses, only=only)[0]
 
 
-def _gap(
-    engine: Engine, shape: RodShape, poses: Floats, only: int | None = None, rows: Flags | None = None
-) -> Floats:
+def overlap(engine: Engine, shape: RodShape, poses: Floats) -> Floats:
+    """(n_robots, n_obstacles, 3) shortest displacement of each obstacle, at these `poses`, out of each robot,
+    mounting excepted, world [m]; 0 where they are apart, or where there is no shape."""
+    _, found, n_found = _search(engine, shape, poses, margin=0.0)
+    there = np.flatnonzero(np.isfinite(shape.position).all((1, 2)))
+    out = np.zeros((len(shape.position), poses.shape[1], 3))
+    for i, candidates, n in zip(there, found, n_found, strict=True):
+        for one in np.sort(candidates[:n], order="gap")[::-1]:  # the deepest of each obstacle last
+            out[i, one["obstacle"]] = min(one["gap"], 0.0) * one["normal"]
+    return out
+
+
+def _search(
+    engine: Engine,
+    shape: RodShape,
+    poses: Floats,
+    *,
+    only: int | None = None,
+    rows: Flags | None = None,
+    margin: float = _EVERYTHING,
+) -> tuple[Floats, Records, Ints]:
+    """Smallest gap of each robot (n_robots,), nan but for `rows`, where they are given; and of those that
+    have a shape the candidates for contact within `margin` of the rod's length, and how many they are."""
     n, n_points = shape.arclength.shape
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
     surfaces = surfaces._replace(
@@ -65,18 +86,18 @@ def _gap(
         tracked=nobody,
         slides=nobody,
         tolerance=1e-9,
-        margin=_EVERYTHING,
+        margin=margin,
     )
     finite = np.isfinite(shape.position).all((1, 2))
     some = np.flatnonzero(finite if rows is None else finite & rows)
+    found, n_found = np.empty((len(some), MOST_FOUND), CANDIDATE), np.zeros(len(some), np.int64)
     if len(surfaces.primitive):
-        found, n_found = np.empty((len(some), MOST_FOUND), CANDIDATE), np.zeros(len(some), np.int64)
         search_gaps(1, some, engine.rods, surfaces, motion, found, n_found, search_work(1, n_points))
     if only is None and engine.rods_meet:
         engine.lower_gaps(some, motion)
     gap = np.full(n, np.nan)
     gap[some] = known.gap[some]
-    return gap
+    return gap, found, n_found
 
 
 def swept_clearance(
@@ -102,7 +123,7 @@ def swept_clearance(
         there = after._replace(
             position=(1.0 - fraction) * before.position + fraction * after.position, rotation=tangent
         )
-        gap = _gap(engine, there, between(poses_before, engine.poses, t), rows=some)
+        gap = _search(engine, there, between(poses_before, engine.poses, t), rows=some)[0]
         return np.where(np.isnan(gap), np.inf, gap)
 
     wanted = np.isfinite(after.position).all((1, 2)) & (np.ones(n, bool) if rows is None else rows)

@@ -15,7 +15,9 @@ from fastrod.rotation import cross, matrix_from_quaternion, product
 from fastrod.solver.state import State
 from fastrod.types import Floats
 
-_LEFT = 0.8  # of an overlap after a step
+# of an overlap the rod does not see: it would have the body out at once, at overlap / dt. Of a small one it
+# sees twice what passes for none, so that none stays [m]
+_LEFT, _SEEN = 0.8, 2e-5
 # Newmark's rule, beta 0.3025, gamma 0.6, which takes a tenth of the energy that an implicit Euler step takes:
 # weights of the force at the end of a step, of the one a step before, and of the one before that
 _COMING, _LAST, _EARLIER = 0.3025, 0.495, 0.2025
@@ -89,11 +91,6 @@ class BodyContact(ABC):
         """Motion of the centre of mass' frame now."""
 
     @abstractmethod
-    def overlap(self, capsules: Sequence[int]) -> Floats:
-        """Return the displacement (3,) out of the deepest overlap with one of these bodies or geoms of its
-        engine, world [m]; zero where it overlaps none."""
-
-    @abstractmethod
     def apply(self, wrench: Floats) -> None:
         """Feel (6,) force [N] and moment about the centre of mass [N m], world, during the engine's next
         step, with what was applied for that before."""
@@ -108,15 +105,30 @@ class BodyContact(ABC):
         return mobility, pose[:3], mobility @ (np.zeros(6) if self._alone else self._before)
 
     @final
+    def now(self) -> dict[str, Floats]:
+        """Return the pose (7,) of each shape."""
+        return self._at(self.com().pose)
+
+    def _at(self, pose: Floats) -> dict[str, Floats]:
+        """Poses (7,) of the shapes where the centre of mass' frame has this one."""
+        rotation = matrix_from_quaternion(pose[None, 3:])[0]
+        return {
+            shape.obstacle.name: np.concatenate(
+                [pose[:3] + rotation @ shape.position, product(pose[3:], shape.quaternion)]
+            )
+            for shape in self.shapes
+        }
+
+    @final
     def expected(
-        self, capsules: Sequence[int], gravity: Floats, others: Sequence[BodyContact] = ()
+        self, gravity: Floats, overlap: Floats, others: Sequence[BodyContact] = ()
     ) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Return pose (7,) and velocity (6,) of each shape at the end of the next step, were it not for the
         rod. What fell by `gravity` (3,) in the last one falls on. If `others` push the body, it is pushed as
         they have begun to, or else as in the last one, and by the rod as in that.
 
-        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected mostly
-        outside: out at once it would leave at overlap / dt.
+        What overlaps the rod already, as where a contact was lost for a step, is expected mostly outside:
+        `overlap` (n_shapes, 3) is `Simulator.overlap` of each shape where it is now.
         """
         motion = self.com()
         if self.mass > 0.0:
@@ -133,16 +145,15 @@ class BodyContact(ABC):
             motion = motion._replace(velocity=velocity)
         pose = motion.after(self.dt)
         if self.mass > 0.0:
-            pose[:3] += _LEFT * self.overlap(capsules)
-        rotation = matrix_from_quaternion(pose[None, 3:])[0]
-        poses, velocities = {}, {}
-        for shape in self.shapes:
-            arm = rotation @ shape.position
-            poses[shape.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], shape.quaternion)])
-            linear = motion.velocity[:3] + cross(motion.velocity[3:], arm)
-            velocities[shape.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
-        self._poses = poses
-        return poses, velocities
+            depth = np.linalg.norm(overlap, axis=1)
+            most = int(depth.argmax())
+            out = min(_LEFT * depth[most], max(depth[most] - _SEEN, 0.0))
+            pose[:3] += out / max(depth[most], _SEEN) * overlap[most]
+        self._poses, velocities = self._at(pose), {}
+        for name, place in self._poses.items():
+            linear = motion.velocity[:3] + cross(motion.velocity[3:], place[:3] - pose[:3])
+            velocities[name] = np.concatenate([linear, motion.velocity[3:]])
+        return self._poses, velocities
 
     @property
     def _coming(self) -> Floats:

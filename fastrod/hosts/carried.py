@@ -88,10 +88,6 @@ class CarriedRod(ABC):
         """(3,) of the engine's world as it is now [m/s^2]."""
 
     @abstractmethod
-    def _shapes(self) -> Sequence[int]:
-        """The engine's numbers of the capsules."""
-
-    @abstractmethod
     def _place(self) -> None:
         """Capsules stand where the rod is."""
 
@@ -263,9 +259,12 @@ class CarriedRod(ABC):
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         theirs = [other for rod in self._others() for other in rod.body_contacts]
-        for k, contact in enumerate(self.body_contacts):
+        now = {name: pose for contact in self.body_contacts for name, pose in contact.now().items()}
+        overlap = np.zeros((len(now), 3)) if self.state is None else self.simulator.overlap(now)[0]
+        of_each = np.split(overlap, np.cumsum([len(contact.names) for contact in self.body_contacts[:-1]]))
+        for k, (contact, own) in enumerate(zip(self.body_contacts, of_each, strict=True)):
             others = [other for other in theirs if other.number == contact.number]
-            p, v = contact.expected(self._shapes(), world["gravity"], others)
+            p, v = contact.expected(world["gravity"], own, others)
             for name in contact.names:
                 mobility, center, ahead = contact.mobility()
                 self.simulator.set_free(name, mobility, center, k, ahead)

@@ -42,18 +42,6 @@ class BulletBodyContact(BodyContact):
         """Motion of the centre of mass' frame, not of the link's URDF frame."""
         return com_motion(self.bullet, self.body, self.link)
 
-    def overlap(self, capsules: Sequence[int]) -> Floats:
-        """Return the link's displacement (3,) out of its deepest overlap with one of these bodies, world [m];
-        its length is the depth."""
-        found = [
-            p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)
-        ]
-        if not found:
-            return np.zeros(3)
-        deepest = min(found, key=lambda p: p[8])
-        # its normal points from the link to the capsule
-        return np.asarray(min(deepest[8], 0.0) * np.array(deepest[7]))
-
     def apply(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the centre of mass [N m], world, for one `stepSimulation`: then
         PyBullet forgets it."""
@@ -166,9 +154,6 @@ class MountedRod(CarriedRod):
 
     def _gravity(self) -> Floats:
         return self.bullet.gravity
-
-    def _shapes(self) -> Sequence[int]:
-        return self.bodies.ids
 
     def _place(self) -> None:
         self.bodies.stand(*self.rod.capsules[:2])

@@ -232,9 +232,6 @@ class MujocoRod(CarriedRod):
         off = self.model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY)
         return np.zeros(3) if off else np.array(self.model.opt.gravity)
 
-    def _shapes(self) -> Sequence[int]:
-        return self._geoms
-
     def _place(self) -> None:
         capsules = self.rod.capsules
         self.data.mocap_pos[self._mocap] = capsules.center

@@ -44,17 +44,6 @@ class MujocoBodyContact(BodyContact):
         inertia."""
         return com_motion(self.model, self.data, self.body)
 
-    def overlap(self, capsules: Sequence[int]) -> Floats:
-        """Return the body's displacement (3,) out of the deepest overlap of one of its geoms with one of
-        these, world [m]; its length is the depth."""
-        lib = mujoco()
-        deepest, separation, ends = 0.0, np.zeros(3), np.zeros(6)
-        for own in capsules:
-            for geom in self.geoms:
-                if (gap := lib.mj_geomDistance(self.model, self.data, own, geom, 0.0, ends)) < deepest:
-                    deepest, separation = gap, ends[:3] - ends[3:]
-        return separation
-
     def apply(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the centre of mass [N m], world, with the last; it acts until
         `release`."""

@@ -306,6 +306,26 @@ def test_queries():
     assert free.swept_clearance()[0] <= ends[0] + 1e-12
 
 
+def test_overlap_is_the_way_out():
+    scene = ContactScene(obstacles=[sphere(0.01, name="ball"), cylinder(0.01, 0.2, name="bar")])
+    sim = fastrod.Simulator(prototype(), n_robots=2, contact=scene, feel_contact=False)
+    sim.settle(bent([3.0, 9.0]))
+    poses = {
+        "ball": np.array([0.01, 0.006, 0.05, 1.0, 0.0, 0.0, 0.0]),
+        "bar": np.array([0.02, 0.0, 0.04, 0.0, 0.0, 0.6, 0.8]),
+    }
+    out = sim.overlap(poses)
+    assert (np.linalg.norm(out, axis=2) > 1e-4).any(0).all()
+    for k, (name, pose) in enumerate(poses.items()):
+        there = np.tile(pose, (2, 1))
+        there[:, :3] += out[:, k]
+        sim.step(bent([3.0, 9.0]), obstacle_pose={name: there})
+        inside = out[:, k].any(1)
+        assert_allclose(sim.clearance(name)[inside], 0.0, rtol=0, atol=1e-9)
+        assert (sim.clearance(name)[~inside] > 0.0).all()
+        assert not sim.overlap({})[~inside, k].any()
+
+
 def test_obstacles_that_are_seen_and_not_felt():
     sim = fastrod.Simulator(prototype(1e-5), n_robots=2, contact=wall(), feel_contact=False)
     twin = fastrod.Simulator(prototype(1e-5), n_robots=2)

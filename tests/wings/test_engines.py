@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bullets import soft_robot
-from engines import BEYOND, ENGINES, MASS, SIZE, SPEED, Cube
+from engines import BEYOND, ENGINES, MASS, RADIUS, SIZE, SPEED, Cube
 from numpy.testing import assert_allclose
 
 import fastrod
@@ -108,6 +108,15 @@ def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it(stage):
     assert_allclose(state.tip_position, expected.tip_position, atol=1e-6)
     if stage is ENGINES["pybullet"]:
         assert len(s.world.getContactPoints(s.rod.bodies.ids[-1], s.cubes[0])) == 0  # one contact, not two
+
+
+def test_body_that_overlaps_the_mounting_is_felt_where_it_is(stage):
+    mounting = 1.5 * RADIUS
+    world = stage(soft_robot(), cubes=[Cube(SIZE, MASS, (mounting - RADIUS - 0.002 - SIZE / 2, 0.0, 0.0))])
+    for _ in range(2):  # in the first step the capsules are not there yet
+        state = world.rod.step()
+        assert state.contacts.clearance[0] == pytest.approx(0.002, abs=1e-9)
+    assert not world.velocity().any()
 
 
 def test_touched_body_may_be_put_somewhere_else(stage):
