@@ -16,13 +16,15 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 # of an overlap the rod does not see: it would have the body out at once, at overlap / dt. Of a small one it
-# sees twice what passes for none, so that none stays [m]
-_LEFT, _SEEN = 0.8, 2e-5
+# sees a little more than what passes for none, so that none stays [m]
+_LEFT, _SEEN = 0.8, 1.1e-5
 # Newmark's rule, beta 0.3025, gamma 0.6, which takes a tenth of the energy that an implicit Euler step takes:
 # weights of the force at the end of a step, of the one a step before, and of the one before that
 _COMING, _LAST, _EARLIER = 0.3025, 0.495, 0.2025
 # of the last force has been felt when the rule begins: the engine's speed is that of half a step before
 _FELT = 0.4
+_HELD = 0.5  # of the push of rods at least is what holds a body against them
+_STILL = 0.2  # of the speed that they would give a body in a step it has where it is held
 _ALIKE = 0.5  # by less of it a force differs from the one before where a contact lasts
 
 
@@ -77,7 +79,7 @@ class BodyContact(ABC):
         world."""
         self._begun = False  # the rod has pushed since the engine's step
         self._felt: Floats = np.zeros(6)  # what it exerted in that
-        self._speed: Floats = np.full(3, np.nan)  # of the body before that
+        self._speed: Floats = np.full(6, np.nan)  # of the body before that
         self._poses: dict[str, Floats] = {}  # of its obstacles, as the step expects them
         self._before: Floats = np.zeros(6)
         self._lost = False  # the rod's forces of the last step were not known
@@ -133,15 +135,16 @@ class BodyContact(ABC):
         motion = self.com()
         if self.mass > 0.0:
             theirs = sum((other._coming for other in others), np.zeros(6))
-            self._alone = not theirs.any()
-            coming = theirs + (self._past if self._alone else self._coming)
             by_force = inverse_inertia(self.mass, self._inertia, motion.pose)
-            velocity = motion.velocity + self.dt * by_force @ coming
             felt = sum((other._felt for other in others), self._felt)
-            gained, expected = motion.velocity[:3] - self._speed, felt[:3] / self.mass + gravity
-            if np.linalg.norm(gained - self.dt * expected) < 0.5 * self.dt * np.linalg.norm(gravity):
-                velocity[:3] += self.dt * gravity
-            self._speed = motion.velocity[:3]
+            besides = (motion.velocity - self._speed) / self.dt - by_force @ felt
+            falls = np.linalg.norm(besides[:3] - gravity) < 0.5 * np.linalg.norm(gravity)
+            held = np.zeros(6) if falls else _support(besides, felt, by_force, motion.velocity, self.dt)
+            self._alone = not (theirs.any() or held.any())
+            coming = theirs + (self._past if self._alone else self._coming)
+            self._speed = motion.velocity
+            velocity = motion.velocity + self.dt * (by_force @ coming + held)
+            velocity[:3] += self.dt * gravity * falls
             motion = motion._replace(velocity=velocity)
         pose = motion.after(self.dt)
         if self.mass > 0.0:
@@ -216,7 +219,7 @@ class BodyContact(ABC):
     def forget(self) -> None:
         """The body was put somewhere else: no force carries over."""
         self._before, self.exerted, self._lost = np.zeros(6), np.zeros(6), False
-        self._begun, self._felt, self._speed = False, np.zeros(6), np.full(3, np.nan)
+        self._begun, self._felt, self._speed = False, np.zeros(6), np.full(6, np.nan)
         self._begin_anew()
 
     def _stopping(self, wrench: Floats) -> float:
@@ -234,3 +237,17 @@ class BodyContact(ABC):
     def _exert(self, wrench: Floats) -> None:
         if wrench.any():
             self.apply(wrench)
+
+
+def _support(besides: Floats, felt: Floats, by_force: Floats, velocity: Floats, dt: float) -> Floats:
+    """Return the acceleration (6,) by what holds a body against rods, 0 where nothing does: of what it had
+    `besides` that by their wrench (6,), which it has `felt`, as much as that was, and across its motion;
+    along it that is friction, which ends with the motion."""
+    pushed, inertia = felt @ by_force @ felt, np.linalg.inv(by_force)
+    if not pushed > 0.0:
+        return np.zeros(6)
+    along = inertia @ velocity
+    across: Floats = besides - velocity * (along @ besides) / (along @ velocity + (_STILL * dt) ** 2 * pushed)
+    if not -(across @ felt) > _HELD * pushed:
+        return np.zeros(6)
+    return across * min(1.0, float(np.sqrt(pushed / (across @ inertia @ across))))
