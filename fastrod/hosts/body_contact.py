@@ -48,7 +48,9 @@ class BodyContact(ABC):
     which the coming one is a third.
 
     Of several rods that push one body each has it under the forces of all, and moves it on from there: so
-    they hold it between them. It feels the coming force alone: a mean of what sticks, which is rigid, rings.
+    they hold it between them. Something else may hold the body against them, as a floor, a joint or a spring
+    does. No engine is asked for it: it is taken to do so as in the last step. What is held feels the coming
+    force alone: a mean of what sticks, which is rigid, rings.
 
     After a step in which the rod's forces are not known it only stops the body, until that takes all it has.
     """
@@ -126,8 +128,9 @@ class BodyContact(ABC):
         self, gravity: Floats, overlap: Floats, others: Sequence[BodyContact] = ()
     ) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Return pose (7,) and velocity (6,) of each shape at the end of the next step, were it not for the
-        rod. What fell by `gravity` (3,) in the last one falls on. If `others` push the body, it is pushed as
-        they have begun to, or else as in the last one, and by the rod as in that.
+        rod. What fell by `gravity` (3,) in the last one falls on, and what was held in it is held. If
+        `others` push the body, it is pushed as they have begun to, or else as in the last one, and by the rod
+        as in that.
 
         What overlaps the rod already, as where a contact was lost for a step, is expected mostly outside:
         `overlap` (n_shapes, 3) is `Simulator.overlap` of each shape where it is now.
