@@ -40,9 +40,7 @@ class _Begun(NamedTuple):
     before: RodSnapshot
     motion: Motion
     given: dict[str, Any]
-    """Inputs of the rod for a base whose motion is given."""
-    factor: float = 1.0
-    """By so much more the rod has resisted than its stiffness says, as where inputs jump."""
+    """Inputs of the rod, but those of its base."""
 
 
 class CarriedRod(ABC):
@@ -145,16 +143,10 @@ class CarriedRod(ABC):
         inputs, self._begun = _checked(inputs), None
         begins, motion, given = self.state is None, self._host.motion(), self._scene() | inputs
         if self.rod.simulator.dynamics:
-            state = self.state = self._with_others(motion, given)
+            state = self._with_others(motion, given)
         else:
             state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given)
-        if state.ok[0]:
-            self.wrench = self._push(state, motion.pose[:3])
-        else:
-            self.wrench = 0.5 * self.wrench
-            for contact in self.body_contacts:
-                contact.push_half()
-        self._host.exert(self.wrench)
+            self._exert(state, motion.pose[:3])
         (self._place if begins else self._head_for)()
         return state
 
@@ -179,6 +171,16 @@ class CarriedRod(ABC):
         for contact in self.body_contacts:
             contact.forget()
 
+    def _exert(self, state: State, point: Floats) -> None:
+        """Let the host, and what the rod touches, feel this `state`; the base was at `point` (3,)."""
+        if state.ok[0]:
+            self.wrench = self._push(state, point)
+        else:
+            self.wrench = 0.5 * self.wrench
+            for contact in self.body_contacts:
+                contact.push_half()
+        self._host.exert(self.wrench)
+
     def _push(self, state: State, point: Floats, again: bool = False) -> Floats:
         """Push what the rod touches; wrench (6,) on the host, about the base `point` (3,) before the step."""
         wrench = self.rod.wrench
@@ -189,24 +191,35 @@ class CarriedRod(ABC):
         return wrench
 
     def _with_others(self, motion: Motion, given: dict[str, Any]) -> State:
-        """One step of a rod that moves, and of those on the same body that have begun theirs: these are taken
-        to give way by their stiffness, then do their step again where that has them, until both say the
-        same."""
-        others = [rod for rod in self._others() if rod._begun and self._host.moves_with(rod._host)]
-        before = self.rod.snapshot()
-        for again in reversed(range(_ROUNDS)):
-            freedom = self._host.freedom(self.dt, [(rod._host, rod.wrench) for rod in others])
-            alone, leads = _together(freedom, [rod._stiffness() for rod in others], self.dt)
-            base = {"inverse_inertia": alone.inverse_inertia, "free_twist": alone.twist[:6]}
-            state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given, **base)
-            twists = alone.twist[6:].reshape(-1, 6) + self.dt * leads @ self.rod.wrench
-            agreed = [rod._go_with(twist) for rod, twist in zip(others, twists, strict=True)]
-            if all(agreed) or not again:
+        """One step of a rod that moves, and of those on the same body that have begun theirs, in turn: each
+        feels what the others exert, and these give way by their stiffness; until none is to change."""
+        rods = [self, *(rod for rod in self._others() if rod._begun and self._host.moves_with(rod._host))]
+        freedom = self._host.freedom(self.dt, [(rod._host, rod.wrench) for rod in rods[1:]])
+        every, exerted = freedom.inverse_inertia, np.stack([np.zeros(6), *(rod.wrench for rod in rods[1:])])
+        bare = freedom.twist - self.dt * every @ exerted.ravel()
+        before, places = self.rod.snapshot(), np.arange(6 * len(rods)).reshape(-1, 6)
+        for count in range(_ROUNDS):
+            agreed = True
+            for k, rod in enumerate(rods):
+                twist = (bare + self.dt * every @ exerted.ravel())[places[k]]
+                if rod._begun and not rod._is_changed(twist):
+                    continue
+                order = np.roll(places, -k, axis=0).ravel()
+                theirs = exerted * (np.arange(len(rods)) != k)[:, None]
+                own = Freedom(every[np.ix_(order, order)], (bare + self.dt * every @ theirs.ravel())[order])
+                own = _together(own, [other._stiffness() for other in (*rods[k + 1 :], *rods[:k])], self.dt)
+                base = {"inverse_inertia": own.inverse_inertia, "free_twist": own.twist}
+                if rod._begun is None:
+                    self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **given, **base)
+                    self._begun = _Begun(before, motion, given)
+                    self._exert(self.state, motion.pose[:3])
+                else:
+                    rod._do_again(base)
+                exerted[k], agreed = rod.wrench, agreed and count == k == 0
+            if agreed:
                 break
-            self.rod.restore(before)
-        held = {"inverse_inertia": _HELD * freedom.inverse_inertia[:6, :6]}
-        self._begun = _Begun(before, motion, given | held)
-        return state
+        assert self.state is not None
+        return self.state
 
     def _others(self) -> list[CarriedRod]:
         """All other rods of this world."""
@@ -216,40 +229,39 @@ class CarriedRod(ABC):
         """(6, 6) by how much the rod's wrench falls by more motion of its base in the step that it has begun,
         0 where none is known; and the twist (6,) at which that has gone."""
         begun, state, stiffness = self._begun, self.state, np.full((6, 6), np.nan)
-        if begun is not None and state is not None and state.ok[0] and begun.given["inverse_inertia"].any():
-            stiffness = begun.factor * self.rod.stiffness
+        known = state is not None and state.ok[0] and state.mean_wrench is not None  # a rest has none
+        if begun is not None and known:
+            stiffness = self.rod.stiffness
         if begun is None or not np.isfinite(stiffness).all():  # of a step that could not be done again, too
             return np.zeros((6, 6)), np.full(6, np.nan)
         size, axes = np.linalg.eigh(stiffness)
         resists = (axes * np.maximum(size, 0.0)) @ axes.T  # a rod that buckles helps, which nobody counts on
         return resists, displacement(begun.motion.pose, self.rod.base) / self.dt
 
-    def _go_with(self, twist: Floats) -> bool:
-        """Do the begun step again, on a base of this `twist` (6,), if that matters: the host feels the
-        difference. Return whether its stiffness had it so. A step that cannot be solved there is as its
-        stiffness has it."""
-        begun, (stiffness, went), before = self._begun, self._stiffness(), self.wrench
-        expected = -self.dt * stiffness @ (twist - went)
+    def _is_changed(self, twist: Floats) -> bool:
+        """Whether the rod is to exert something else than it has, with its base at this `twist` (6,)."""
+        stiffness, went = self._stiffness()
         unit = np.repeat([1.0, 1.0 / self.rod.robot.length], 3)
-        little = _ALIKE * np.abs(unit * before).max()
-        if begun is None or not np.abs(unit * expected).max() > little:
-            return True
-        (pose, velocity), after, more = begun.motion, self.rod.snapshot(), expected
+        change = np.abs(unit * (self.dt * stiffness @ (twist - went))).max()
+        return bool(change > _ALIKE * np.abs(unit * self.wrench).max())
+
+    def _do_again(self, base: dict[str, Floats]) -> None:
+        """Do the begun step again on a base that moves so: the host feels the difference. A step that cannot
+        be solved there stays."""
+        begun, after = self._begun, self.rod.snapshot()
+        assert begun is not None
         self.rod.restore(begun.before)
         try:
-            state = self.rod.advance(pose, velocity, self.dt, **begun.given, free_twist=twist)
+            state = self.rod.advance(begun.motion.pose, begun.motion.velocity, self.dt, **begun.given, **base)
         except HostError:
             state = None
         if state is None or not state.ok[0]:
             self.rod.restore(after)
-        else:
-            self.state, more = state, self._push(state, pose[:3], again=True) - before
-        self.wrench = before + more
+            return
+        more = self._push(state, begun.motion.pose[:3], again=True) - self.wrench
+        self.state, self.wrench = state, self.wrench + more
         self._host.exert(more)
         self._head_for()
-        factor = float(more @ expected) / max(float(expected @ expected), 1e-300)
-        self._begun = begun._replace(factor=min(max(factor, 0.5), 2.0) * begun.factor)
-        return bool(np.abs(unit * (more - expected)).max() <= little)
 
     def _scene(self) -> dict[str, Any]:
         """Return the rod's inputs from the world: gravity, and the bodies around."""
@@ -273,10 +285,9 @@ class CarriedRod(ABC):
         return world | {"obstacle_pose": poses, "obstacle_velocity": velocities}
 
 
-def _together(freedom: Freedom, others: Sequence[tuple[Floats, Floats]], dt: float) -> tuple[Freedom, Floats]:
-    """`freedom` of the first of its bases, and the twists of the others, where on each of these a rod resists
-    by its stiffness (6, 6) what it does beyond where it went (6,); and by how much a wrench on the first
-    accelerates each (n_others, 6, 6).
+def _together(freedom: Freedom, others: Sequence[tuple[Floats, Floats]], dt: float) -> Freedom:
+    """`freedom` of the first of its bases, where on each of the others a rod resists by its stiffness (6, 6)
+    what that does beyond where it went (6,).
 
     A wrench w moves the others by e = dt^2 (G_o1 w - G_oo K (e - r)) beyond where they are without it, of
     which they went r already, and the first by dt^2 (G_11 w - G_1o K (e - r)).
@@ -288,10 +299,9 @@ def _together(freedom: Freedom, others: Sequence[tuple[Floats, Floats]], dt: flo
         resists[here, here] = stiffness
         ahead[here] = np.nan_to_num(went - freedom.twist[6:][here])
     left = np.linalg.inv(np.eye(n) + dt**2 * every[6:, 6:] @ resists)
-    leads, back = left @ every[6:, :6], dt**2 * every[:6, 6:] @ resists
-    twist = freedom.twist + np.concatenate([back @ left @ ahead, ahead - left @ ahead])
-    mobility = every[:6, :6] - back @ leads
-    return Freedom(0.5 * (mobility + mobility.T), twist), leads.reshape(-1, 6, 6)
+    back = dt**2 * every[:6, 6:] @ resists @ left
+    mobility = every[:6, :6] - back @ every[6:, :6]
+    return Freedom(0.5 * (mobility + mobility.T), freedom.twist[:6] + back @ ahead)
 
 
 def rod_of(

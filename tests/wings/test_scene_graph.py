@@ -19,7 +19,6 @@ from fastrod_viewer.picture.scene_graph import (
     Picture,
     Trail,
     ViewOptions,
-    ball,
     bounds,
     ghost,
     grid_places,
@@ -438,11 +437,6 @@ def test_trail_keeps_the_last_positions_and_fades():
         Trail(0, 0.01)
 
 
-def test_ball_that_is_nowhere_has_no_size():
-    found = check({"ball": ball([[0.1, 0.2, 0.3], [np.nan, 0.0, 0.0]], 0.01, (1, 2, 3))})["ball"]
-    assert_allclose(found.scale[:, 0], [0.01, 0.0])
-
-
 # meshes, places, words
 
 
@@ -468,26 +462,6 @@ def test_open_meshes_face_outward(name):
     outward = corners.mean(1) * [1.0, 1.0, name == "cap"]
     assert (np.einsum("ij,ij->i", normal, outward) > 0.0).all()
     assert_allclose(np.linalg.norm(mesh.vertices[:, : 3 if name == "cap" else 2], axis=1), 1.0, atol=1e-6)
-
-
-def test_meshes_have_the_sizes_they_are_said_to_have():
-    def extent(name):
-        vertices = SHAPES[name].vertices
-        return vertices.min(0).round(5).tolist(), vertices.max(0).round(5).tolist()
-
-    for name in ("tube", "thin_tube", "bar", "disc"):
-        assert extent(name) == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
-    assert extent("ball") == ([-1.0] * 3, [1.0] * 3)
-    assert extent("cone") == extent("cap") == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
-
-
-def test_grid_is_square_and_centred():
-    for n in (1, 2, 5, 16, 64):
-        places = grid_places(n, 0.3)
-        assert places.shape == (n, 3)
-        assert_allclose(places.min(0) + places.max(0), 0.0, atol=1e-12)
-        assert len(np.unique(places.round(6), axis=0)) == n
-        assert np.ptp(places[:, 1]) <= np.ptp(places[:, 0]) == pytest.approx(0.3 * (np.ceil(np.sqrt(n)) - 1))
 
 
 def test_bounds_hold_the_robots():
