@@ -23,8 +23,9 @@ _LEFT, _SEEN = 0.8, 1.1e-5
 _COMING, _LAST, _EARLIER = 0.3025, 0.495, 0.2025
 # of the last force has been felt when the rule begins: the engine's speed is that of half a step before
 _FELT = 0.4
-_HELD = 0.5  # of the push of rods at least is what holds a body against them
-_STILL = 0.2  # of the speed that they would give a body in a step it has where it is held
+# of the push of rods at least is what holds a body against them (by 0.2, cubes that MuJoCo's friction lifts
+# are pushed at 1.4 times the rod's speed), and of the speed that this gives a body in a step it has at most
+_HELD, _STILL = 0.5, 0.2
 _ALIKE = 0.5  # by less of it a force differs from the one before where a contact lasts
 
 

@@ -26,7 +26,6 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
-_HELD = 1e-9  # of the mobility of a base: one whose motion is given
 _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
 _RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
     weakref.WeakValueDictionary
