@@ -97,7 +97,7 @@ def test_what_falls_is_expected_where_it_falls_and_what_lies_where_it_lies(engin
 
 def test_cylinder_that_hangs_in_a_hook_lies_on_the_rod():
     # the engine's capsules are chords, which lie up to 0.16 mm nearer to it than the rod
-    dt, bend = 0.01, 2.6
+    dt, bend, depth = 0.01, 2.6, []
     world, robot = empty_world(dt), soft_robot(line_density=0.05, damping_time=0.05)
     shape = world.createCollisionShape(world.GEOM_CYLINDER, radius=0.03, height=0.2)
     lowest = robot.length / bend
@@ -106,7 +106,6 @@ def test_cylinder_that_hangs_in_a_hook_lies_on_the_rod():
     rod = MountedRod(robot, carrier(world, "-z"), contact_bodies=[hung], friction=0.3)
     along = bend * (np.array(robot.tendon_segment) + 1) / robot.n_segments
     pull = [t.offset * np.cos(t.angle) * a for t, a in zip(robot.tendons, along, strict=True)]
-    depth = []
     for k in range(round(0.6 / dt)):
         if k == 2:
             world.setGravity(0.0, 0.0, -9.81)

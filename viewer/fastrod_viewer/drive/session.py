@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import threading
 import time
@@ -342,7 +343,7 @@ class Session:
         steps = int((began - due) / apart + 1e-6)
         if self._steps:
             steps, self._steps = max(1, round(1.0 / RATE / apart)), self._steps - 1
-            due = began - steps * apart
+            due, most = began - steps * apart, math.inf  # what was asked for, however long it takes
         elif at_once and steps == 0 and not rings:  # a step for every command would hurry slow motion
             steps, due = 1, began - apart
         for _ in range(steps):
