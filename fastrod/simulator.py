@@ -390,7 +390,7 @@ class Simulator(RobotBatch):
         state, bare = self._state, self._bare
         assert state is not None
         assert bare is not None
-        by_force = np.asarray(self._linear(ports).by_force())
+        by_force = np.asarray(self._linear(ports).by_load())[..., :3]
         force, slopes = self._chain.tip_feedback(bare, self._plain, state, self._layout.n_steps)
         moved = np.zeros((len(force), 3, jacobian.shape[2]))
         if turning:
@@ -403,12 +403,13 @@ class Simulator(RobotBatch):
         return change
 
     @one_blas_thread
-    def compliance(self) -> Floats:
+    def compliance(self, *, moments: bool = False) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation
-        and contact forces held."""
+        and contact forces held. With `moments` (n_robots, 6, 6): three columns more, by the tip's moment
+        [N m]."""
         ports = self._last("compliance")[1]
-        by_force = np.asarray(self._linear(ports).by_force())
-        return self._with_feedback(by_force, ports, False) if self._chain.feels_tip else by_force
+        by_load = np.asarray(self._linear(ports).by_load())[..., : 6 if moments else 3]
+        return self._with_feedback(by_load, ports, False) if self._chain.feels_tip else by_load
 
     def set_free(
         self,

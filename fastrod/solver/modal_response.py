@@ -47,19 +47,19 @@ class ModalLinear:
         inputs += [("extension", k, length) for k in range(len(layout.first_tendon))]
         columns = [self._by_port(name, k, _STEP * size, relocate) for name, k, size in inputs]
         columns += [self._by_rotation(k) for k in range(3 if turning else 0)]
-        return self._close(np.stack([c[0] for c in columns], 2), np.stack([c[1] for c in columns], 2))
+        moved = (np.stack([column[k] for column in columns], 2) for k in range(2))
+        return self._close(self.modal.derive(self.rows, self.ports), *moved)
 
-    def by_force(self) -> Floats:
-        """(n_robots, 6, 3) change of the tip per tip force."""
-        moved = np.swapaxes(self.modal.derive(self.rows, self.ports, wanted=()).tip[:, :3], 1, 2)
-        return self._close(np.zeros((len(moved), 6, 3)), -moved)
-
-    def _close(self, tip: Floats, gradient: Floats) -> Floats:
-        """(n_robots, 6, m) of the changes (n_robots, 6, m) and (n_robots, n_q, m) at fixed unknowns."""
+    def by_load(self) -> Floats:
+        """(n_robots, 6, 6) change of the tip per tip force and moment."""
         found = self.modal.derive(self.rows, self.ports)
+        return self._close(found, np.zeros((len(found.tip), 6, 6)), -np.swapaxes(found.tip, 1, 2))
+
+    def _close(self, found: ModalDerivatives, tip: Floats, gradient: Floats) -> Floats:
+        """(n_robots, 6, m) of the changes (n_robots, 6, m) and (n_robots, n_q, m) at fixed unknowns."""
         answer = np.full(tip.shape, np.nan)
         some = self.rows
-        moved = np.linalg.solve(stiffness(found)[some], gradient[some])
+        moved = np.linalg.solve(stiffness(found, self.ports.tip_moment)[some], gradient[some])
         answer[some] = tip[some] - found.tip[some] @ moved
         return answer
 
@@ -105,20 +105,27 @@ class ModalLinear:
         return answer
 
 
-def stiffness(found: ModalDerivatives) -> Floats:
-    """(n_robots, n_q, n_q) derivative of the gradient, with the rotation of forces that follow the rod."""
+def stiffness(found: ModalDerivatives, tip_moment: Floats) -> Floats:
+    """(n_robots, n_q, n_q) derivative of the gradient, with the rotation of forces that follow the rod, and
+    what makes that of a moment (n_robots or 1, 3) unsymmetric: dth_a/dq_b - dth_b/dq_a = th_a x th_b."""
     full, n_nodes = found.hessian, found.line.shape[1]
     if n_nodes:
         change = found.number_change[:, : NODE_VECTORS * n_nodes]
         change = change.reshape(len(full), n_nodes, NODE_VECTORS // 3, 3, -1)  # place, then the directors
         turned = np.einsum("njk,njkca->njca", found.line, change[:, :, 1:])
         full = full - np.einsum("njca,njcb->nab", change[:, :, 0], turned, optimize=True)
-    if not found.force.any():
-        return full
-    x, y, z = found.force.T
+    if found.force.any():
+        full = full + np.swapaxes(found.tip[:, :3], 1, 2) @ _across(found.force) @ found.tip[:, 3:]
+    if tip_moment.any():  # the Hessian has its lower triangle twice
+        full = full - np.triu(np.swapaxes(found.tip[:, 3:], 1, 2) @ _across(tip_moment) @ found.tip[:, 3:], 1)
+    return np.asarray(full)
+
+
+def _across(v: Floats) -> Floats:
+    """(n, 3, 3) matrices of v x."""
+    x, y, z = v.T
     o = np.zeros_like(x)
-    across = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
-    return np.asarray(full + np.swapaxes(found.tip[:, :3], 1, 2) @ across @ found.tip[:, 3:])
+    return np.asarray(np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1))
 
 
 def full_newton(
@@ -137,7 +144,9 @@ def full_newton(
         if not len(some := rows[~ended]):
             break
         found = modal.derive(some, ports, q, wanted=wanted, step=step)
-        change = np.linalg.solve(stiffness(found)[some], found.gradient[some][:, :, None])[:, :, 0]
+        change = np.linalg.solve(stiffness(found, ports.tip_moment)[some], found.gradient[some][:, :, None])[
+            :, :, 0
+        ]
         largest = np.abs(change).max(axis=1, initial=0.0)
         q[some] -= change
         ended[~ended] = largest <= _LAST * np.maximum(1.0, np.abs(q[some]).max(axis=1, initial=0.0))

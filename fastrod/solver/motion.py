@@ -191,7 +191,7 @@ class ModalRods:
         nothing does within the step."""
         if self.dynamics and in_step:
             return np.zeros((self.n_robots, 3, 3))
-        return np.asarray(self.linear(acting, warm).by_force())[:, :3]
+        return np.asarray(self.linear(acting, warm).by_load())[:, :3, :3]
 
     def unstable(self, acting: Acting, shape: RodShape, rows: Ints) -> Ints:
         """None: what Newton's method finds on an energy is a minimum."""

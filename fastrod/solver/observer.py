@@ -163,7 +163,7 @@ class ObserverSolver:
         """(n_robots, 3, 3) by how much the tip gives to a force [m/N]: a step goes on as if nobody had
         looked."""
         kept = self.snapshot()
-        by_force = np.asarray(self.response(acting, warm).by_force())[:, :3]
+        by_force = np.asarray(self.response(acting, warm).by_load())[:, :3, :3]
         self.passes.memory = kept
         return by_force
 

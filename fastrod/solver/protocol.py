@@ -79,8 +79,8 @@ class LinearResponse(Protocol):
         """(n_robots, 6, n_inputs) of the tip, as `Simulator.jacobian`."""
         ...
 
-    def by_force(self) -> Floats:
-        """(n_robots, 6, 3) of the tip, by a force on it."""
+    def by_load(self) -> Floats:
+        """(n_robots, 6, 6) of the tip, by force and moment on it."""
         ...
 
 

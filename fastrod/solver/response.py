@@ -209,16 +209,22 @@ class Linear:
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
         return Linear(twin, rows, ports)
 
-    def by_force(self) -> Floats:
-        """(n, 6, 3) change of the tip per tip force."""
-        response, _ = self.respond()
-        n_x, params = self.passes.n_x, self.passes.params
-        free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
+    def by_load(self) -> Floats:
+        """(n, 6, 6) change of the tip per tip force and moment."""
+        response, shape = self.respond()
+        n_x, layout, params = self.passes.n_x, self.passes.layout, self.passes.params
+        by_unknown = response.tip[:, :, :n_x] @ inverse(response.residual[:, :, :n_x])
+        load = np.zeros((*response.error.shape, 6))
+        load[:, :, :3] = response.residual[:, :, -3:]
+        to_length, row = (params.rod_length / params.moment_scale)[:, None, None], len(layout.row_tendon)
+        if not layout.paper:  # there a tip's moment loads the base alone
+            load[:, row : row + 3, 3:] = -to_length * np.swapaxes(shape.tip_rotation, 1, 2)
         if len(self.ports.follower_force):
             # the follower force is an unknown; a dead force enters as its column, but not its own row
-            load = load.copy()
-            load[:, -3:] -= (params.rod_length**2 / params.moment_scale)[:, None, None] * np.eye(3)
-        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (inverse(free) @ load))
+            load[:, -3:, :3] -= params.rod_length[:, None, None] * to_length * np.eye(3)
+        change = -by_unknown @ load
+        change[:, :, :3] += response.tip[:, :, -3:]
+        return np.asarray(change)
 
 
 def _split(a: Any, k: int) -> Any:

@@ -40,9 +40,9 @@ class Either(NamedTuple):
         both = (each.jacobian(relocate, turning) for each in (self.pressed, self.free))
         return np.where(self.by_modes[:, None, None], *both)
 
-    def by_force(self) -> Floats:
-        """(n_robots, 6, 3) of the tip, by a force on it."""
-        return np.where(self.by_modes[:, None, None], self.pressed.by_force(), self.free.by_force())
+    def by_load(self) -> Floats:
+        """(n_robots, 6, 6) of the tip, by force and moment on it."""
+        return np.where(self.by_modes[:, None, None], self.pressed.by_load(), self.free.by_load())
 
 
 class RestingRods:

@@ -118,7 +118,7 @@ def _balance(
         jump,
         motion,
         q,
-        stiffness(found)[rows],
+        stiffness(found, ports.tip_moment)[rows],
         found.number_change[rows],
         alpha * found.inertia[rows],
         found.damping[rows] if kind != REST else np.zeros_like(found.hessian[rows]),

@@ -71,16 +71,18 @@ def test_jacobian_and_compliance_are_differences(case: str) -> None:
     robot, base = CASES[case]
     sim = Simulator(robot, points_per_segment=6)
     sim.settle(**base, tolerance=1e-13)
-    jacobian, compliance = sim.jacobian()[0], sim.compliance()[0]
+    jacobian, compliance = sim.jacobian()[0], sim.compliance(moments=True)[0]
     columns = [("tendon_length", i, i, 1e-6) for i in range(robot.n_tendons)]
     growing = [k for k, segment in enumerate(robot.segments) if segment.extension[1] > 0.0]
     columns += [("extension", k, robot.n_tendons + k, 1e-5) for k in growing]
     for name, i, column, delta in columns:
         expected = difference(sim, base, name, i, delta)
         assert_allclose(jacobian[:, column], expected, atol=1e-6 * np.abs(expected).max())
-    for a in range(3):
-        expected = difference(sim, base, "tip_force", a, 1e-4)
-        assert_allclose(compliance[:, a], expected, atol=1e-6 * np.abs(compliance).max())
+    loads = {"tip_force": np.zeros(3), "tip_moment": np.zeros(3)} | base
+    for end, name, step in ((3, "tip_force", 1e-4), (6, "tip_moment", 1e-6)):
+        off = 1e-6 * np.abs(compliance[:, :end]).max()
+        for a in range(3):
+            assert_allclose(compliance[:, end - 3 + a], difference(sim, loads, name, a, step), atol=off)
 
 
 def test_tensions_as_inputs() -> None:

@@ -14,6 +14,7 @@ from fastrod.model.robot import Lump
 from fastrod.solver.tape import Tape, Tips, number, with_number
 
 DT = 1e-3
+MOMENT = (1e-3, -5e-4, 5e-4)  # N m
 
 
 def rod(**changes: Any) -> Robot:
@@ -52,7 +53,7 @@ def run(
     sim = Simulator(robot, 1, dt=DT, dynamics=True, outputs="tip", **options)
     trajectory = sim.record()
     force = np.zeros((len(tendon), 3)) if force is None else force
-    sim.settle(tendon[0], tip_force=force[0], tolerance=1e-12)
+    sim.settle(tendon[0], tip_force=force[0], tip_moment=MOMENT, tolerance=1e-12)
     for length, load in zip(tendon[1:], force[1:], strict=True):
         sim.step(length, tip_force=load)
     return sim, trajectory
