@@ -36,9 +36,12 @@ class Gripper:
     finger, and stops them. Both get the same command, so that what is held stays in the middle.
     """
 
-    def __init__(self, bullet: Any, radius: float, max_width: float, color: Sequence[float]) -> None:
+    def __init__(
+        self, bullet: Any, radius: float, max_width: float, color: Sequence[float], mass: float = 0.0
+    ) -> None:
         """`radius` of the head [m]; `max_width` between the inner faces of the open fingers [m], 0 for a head
-        without fingers. Stands at the origin, fingers open. Raises `HostError`."""
+        without fingers; `mass` of the head [kg], where forces move it. Stands at the origin, fingers open.
+        Raises `HostError`."""
         self.bullet = b = Bullet(bullet)
         if not 0.0 <= max_width < 1.0:
             raise HostError(
@@ -53,7 +56,7 @@ class Gripper:
             shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=half)
             visual = b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[0.25, 0.25, 0.28, 1.0])
         self.body: int = b.createMultiBody(
-            0.0,
+            mass,
             head,
             seen,
             linkMasses=[_FINGER_MASS] * n,

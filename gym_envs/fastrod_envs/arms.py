@@ -8,19 +8,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError
-from fastrod.hosts import BulletArm
+from fastrod.hosts import Bullet, BulletArm
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_envs.task import Tube
+from fastrod_envs.tip import NOTHING, UNLOADED, Tip
 
 
 @final
 class SoftArm:
-    """One soft robot free of contact, driven by the actions of `SegmentActions`, on a base that is where it
-    is told."""
+    """One soft robot, driven by the actions of `SegmentActions`, on a base that is where it is told. What it
+    feels is what its `head` meets."""
 
     def __init__(
         self,
@@ -36,8 +37,8 @@ class SoftArm:
         bends [rad/s] and of extensions [m/s]."""
         self.actions = SegmentActions(robot)
         n = robot.n_segments
-        self.simulator = Simulator(robot, dt=dt, points_per_segment=points_per_segment, threads=1)
-        self.dt = dt
+        self.dt, self._points = dt, points_per_segment
+        self.simulator = self._made(robot)
         bend = largest_bend * self.actions.offset
         self.lower: Floats = np.ravel(
             [(robot.segments[k].extension[0], -bend[k], -bend[k]) for k in range(n)]
@@ -53,6 +54,9 @@ class SoftArm:
         """(3 n_segments,) where it is driven [m]."""
         self.base: Floats = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         """(7,) pose of its base: position [m] and quaternion w x y z, world."""
+        self._new = self.simulator.snapshot()
+        self.head: Tip | None = None
+        """The spring of a body at its tip, if there is one."""
         self._state: State | None = None
 
     @property
@@ -71,6 +75,11 @@ class SoftArm:
         return np.asarray(self._now.tip_position[0])
 
     @property
+    def aim(self) -> Floats:
+        """(3,) where the tip would be without what its `head` meets, to first order, world [m]."""
+        return self.tip if self.head is None else self.tip - self.head.deflection()[:3]
+
+    @property
     def tip_rotation(self) -> Floats:
         """(3, 3) world_from_tip."""
         return np.asarray(self._now.tip_rotation[0])
@@ -78,11 +87,25 @@ class SoftArm:
     def begin(self, robot: Robot | None, base: ArrayLike, action: ArrayLike) -> None:
         """Settle from nothing, whatever went before, made anew where another `robot` is given. Raises
         `HostError` where it has no shape."""
-        if robot is not None:
-            self.simulator.replace([0], [robot])
+        if robot is None:
+            self.simulator.restore(self._new)
+        else:
+            self.simulator = self._made(robot)
         self.base, self.action = np.array(base, float), np.array(action, float)
-        self.simulator.reset()
-        self._keep(self.simulator.settle(base_pose=self.base, **self.actions.inputs(self.action)))
+        self.head = None
+        self._keep(self.simulator.settle(base_pose=self.base, **self.actions.inputs(self.action), **UNLOADED))
+
+    def _made(self, robot: Robot) -> Simulator:
+        return Simulator(robot, dt=self.dt, points_per_segment=self._points, threads=1)
+
+    def hold(self, bullet: Bullet, body: int, dt: float, load: Floats = NOTHING) -> Tip:
+        """Rest under `load` (6,), and hold a body at the tip from now on in a world of steps of `dt` [s]
+        (`Tip.hold`)."""
+        given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
+        self._keep(self.simulator.settle(**given, tip_force=load[:3], tip_moment=load[3:]))
+        self.head = Tip(self.simulator, dt)
+        self.head.hold(bullet, body, np.eye(3), load)
+        return self.head
 
     def drive(self, action: Floats, base: Floats | None = None) -> None:
         """One step, at the end of which it is driven to an action, cut to its range, on a base. Raises
@@ -90,7 +113,7 @@ class SoftArm:
         self.action = np.clip(action, self.lower, self.upper)
         self.base = self.base if base is None else base
         given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
-        self._keep(self.simulator.step(**given))
+        self._keep(self.simulator.step(**given) if self.head is None else self.head.solve(**given))
 
     def settle(self, action: Floats) -> None:
         """Come to rest where an action, cut to its range, has it. Raises `HostError` where it is lost."""

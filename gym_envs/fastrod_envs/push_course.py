@@ -12,16 +12,6 @@ from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
-from fastrod_envs.options import EnvOptions
-
-
-@dataclass(frozen=True, kw_only=True)
-class PushOptions(EnvOptions):
-    """Options of Push and QuadrupedPush."""
-
-    feels: bool = True
-    """Whether the force of the cube on the bar bends the robot in its next step; False: the bar moves as
-    if nothing were there."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
-from fastrod_envs.push_course import Course, Drive, PushOptions
+from fastrod_envs.push_course import Course, Drive
 from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
+from fastrod_envs.tip import UNLOADED, Tip, moving_mass
 
 ACCURACY = 0.02
 """Accuracy of the cube's place [m]."""
@@ -30,8 +31,8 @@ SPEED = 0.15
 """Speed of the baseline's tip, the largest [m/s]."""
 TIME = 0.2
 """In which it covers what is left [s]."""
-_STEP = 0.1  # s, the longest of the rod
-_WITHIN = 10  # steps of the world in one of the rod
+_STEP = 0.05  # s, the longest of the rod
+_WITHIN = 5  # steps of the world in one of the rod
 _ON_BAR, _ON_FLOOR = 1.0, 0.25  # friction of the cube
 _POINTS = 4  # of a segment
 _CAPSULES = 2
@@ -40,12 +41,10 @@ _NEAR = 0.1  # m, the longest vector to the goal in an observation
 _AROUND = 0.15  # m, the longest vector to the cube
 _AWAY = 0.6  # m, no cube is pushed farther
 _SHIFT, _SKEW = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
-_MOST = 1.0  # N that a robot feels: a bar that jams the cube against the floor would exert any force
-# s, in which a robot answers what it feels: it has no mass, and would swing with what it pushes
-_RELAXATION = 0.3
 _AT_REST = 1e-5  # m, residual of a robot that counts as at rest
-_PASSES = 8
 _CLEAR = 0.002  # m, of the bar above the floor
+_BAR_MASS = 0.02  # kg
+_SEAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the bar, along the tip's d2
 _FASTEST = 0.3  # m/s, no tip moves faster
 _ROD, _BAR, _CUBE, _GOAL = (0.9, 0.55, 0.15), (0.35, 0.35, 0.38), (0.2, 0.45, 0.8), (0.85, 0.2, 0.15)
 
@@ -59,7 +58,7 @@ class PushCell(Cell):
         self,
         course: Course,
         robot: Robot,
-        options: PushOptions,
+        options: EnvOptions,
         duration: float,
         picture_world: Callable[[], Bullet] | None,
     ) -> None:
@@ -69,28 +68,24 @@ class PushCell(Cell):
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
         self.drive = Drive(robot, course.bend)
-        self._own = self._simulator(robot)
+        self._own = self.simulator = self._simulator(robot)
         self.home = self.drive.posture_for(
             self._own,
             np.array([course.place[0] - course.behind - course.gap, course.place[1], course.height]),
         )
         """(3,) of `Drive` at the start of an episode."""
         self._own.reset()
-        self._own.settle(**self.drive.inputs(self.home), **_load(np.zeros(6)), tolerance=_AT_REST)
+        self._own.settle(**self.drive.inputs(self.home), **UNLOADED, tolerance=_AT_REST)
         self._rest = self._own.snapshot()
-        self.simulator = self._own
         self.world = connect(dt=self._dt / _WITHIN)
         self._studio: Bullet | None = None
         self._tube: RodBodies
-        self._bar: RodBodies
+        self._bar = -1
         self._cube_body = -1
         self.q: Floats = self.home
         """(3,) of `Drive`."""
         self.desired: Floats = np.zeros(2)
         """(2,) goal of the cube, world [m]."""
-        self.felt: Floats = np.zeros(6)
-        """Force of the cube on the bar [N] and its moment about the tip [N m], world: as the robot answers
-        it, with a delay."""
         self.touched = False
         """The robot met the cube in this episode."""
 
@@ -101,21 +96,20 @@ class PushCell(Cell):
         course = self.course
         least, largest = np.array(course.least), np.array(course.largest)
         self.desired = 0.5 * (least + largest) + difficulty * (draws[:2] - 0.5) * (largest - least)
-        self.q, self.felt, self.touched = self.home.copy(), np.zeros(6), False
+        self.q, self.touched = self.home.copy(), False
         if robot is None:
             self.simulator = self._own
             self.simulator.restore(self._rest)
         else:
             self.simulator = self._simulator(robot)
-            self._settled(passes=0)
+            _sound(self.simulator.settle(**self.drive.inputs(self.q), **UNLOADED, tolerance=_AT_REST))
         self._build(
             np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _SKEW * (2.0 * draws[4] - 1.0)
         )
 
     def act(self, action: Floats, duration: float) -> None:
         """Move the numbers of `Drive` by their rates, or toward their places no faster than these, within
-        their ranges and with the bar off the floor: in equal parts of at most 0.1 s, at rest in each. Raises
-        `HostError` where the rod is lost."""
+        their ranges and with the bar off the floor. Raises `HostError` where the rod is lost."""
         drive = self.drive
         if self.options.action == "rate":
             there = self.q + duration * drive.rate * action
@@ -126,7 +120,7 @@ class PushCell(Cell):
         there = np.clip(there, drive.low, drive.high)
         for left in range(self._n, 0, -1):
             self.q = self._clear(self.q + (there - self.q) / left)
-            self._move(self._settled())
+            self._move(_sound(self.tip_body.solve(**self.drive.inputs(self.q))))
 
     def result(self) -> HostedResult:
         """`distance` is from the cube's middle to its goal in the plane [m]; terms exp(-k d^2), and 0.5 once
@@ -162,13 +156,15 @@ class PushCell(Cell):
         return self.desired
 
     def baseline(self) -> Floats:
-        """(3,) straight along the way that the cube has to go, slower when near; the cube stays on the bar,
-        which keeps its height."""
-        drive, ahead = self.drive, self.desired - self._cube()[0][:2]
+        """(3,) straight to the cube, then along the way that it has to go, slower when near; the cube stays
+        on the bar, which keeps its height."""
+        drive, cube = self.drive, self._cube()[0][:2]
+        ahead = self.desired - cube
         d = float(np.hypot(*ahead))
-        velocity = np.array(
-            [*(ahead * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
-        )
+        push = ahead * min(SPEED / max(d, 1e-9), 1.0 / TIME)
+        if not self.touched:
+            push = np.array([0.5 * SPEED, (cube[1] - self.tip[1]) / TIME])
+        velocity = np.array([*push, (self.course.height - self.tip[2]) / TIME])
         jacobian = drive.jacobian(self.simulator) * drive.rate
         rates = scaled_rates(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
         if self.options.action == "rate":
@@ -200,8 +196,11 @@ class PushCell(Cell):
         if self._studio is None:
             self._studio = self._picture_world()
         studio, (position, _) = self._studio, self._cube()
-        tube, bar = _bodies(studio, course, self._own.robots[0])
-        _place(course, self.simulator.state, tube, bar)
+        tube = _capsules(studio, course, self._own.robots[0])
+        bar = RodBodies(studio, course.width, course.thickness, 1, color=(*_BAR, 1.0))
+        state = self.simulator.state
+        tube.place(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY])
+        bar.place(*_bar_nodes(course, state))
         angle = self.world.getBasePositionAndOrientation(self._cube_body)[1]
         box = studio.createVisualShape(
             studio.GEOM_BOX, halfExtents=[0.5 * course.size] * 3, rgbaColor=[*_CUBE, 1.0]
@@ -258,46 +257,35 @@ class PushCell(Cell):
         box = world.createCollisionShape(world.GEOM_BOX, halfExtents=half)
         skewed = [0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle)]
         self._cube_body = int(world.createMultiBody(course.mass, box, -1, [*place, half[0]], skewed))
-        self._tube, self._bar = _bodies(world, course, self._own.robots[0])
-        world.changeDynamics(self._cube_body, -1, lateralFriction=1.0, linearDamping=0.0, angularDamping=0.0)
+        neck = self._own.robots[0]
+        self._tube = _capsules(world, course, neck)
+        mass = _BAR_MASS + moving_mass(neck)
+        capsule = world.createCollisionShape(world.GEOM_CAPSULE, radius=course.thickness, height=course.width)
+        self._bar = int(world.createMultiBody(mass, capsule))
+        undamped = {"linearDamping": 0.0, "angularDamping": 0.0}
+        world.changeDynamics(self._cube_body, -1, lateralFriction=1.0, **undamped)
         world.changeDynamics(ground, -1, lateralFriction=_ON_FLOOR)  # PyBullet multiplies the two
-        for body in (*self._tube.ids, *self._bar.ids):
+        world.changeDynamics(self._bar, -1, lateralFriction=_ON_BAR, **undamped)
+        for body in self._tube.ids:
             world.changeDynamics(body, -1, lateralFriction=_ON_BAR)
-        _place(course, self.simulator.state, self._tube, self._bar)
+            world.setCollisionFilterPair(self._bar, body, -1, -1, 0)
+        state = self.simulator.state
+        self._tube.place(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY])
+        self.tip_body = Tip(self.simulator, self._dt / _WITHIN)
+        self.tip_body.hold(world, self._bar, _SEAT)
 
     def _move(self, state: State) -> None:
-        """Bring the bodies there within a step of the rod, and note what the bar feels."""
-        self._tube.head_for(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY], self._dt)
-        self._bar.head_for(*_bar_nodes(self.course, state), self._dt)
-        total, tip = np.zeros(6), state.tip_position[0]
+        """Bring capsules and bar there within a step of the rod."""
+        nodes = state.position[0, ::_EVERY], state.rotation[0, ::_EVERY]
+        self._tube.head_for(*nodes, self._dt)
+        self.tip_body.follow(_WITHIN)
         for _ in range(_WITHIN):
+            self.tip_body.pull()
             self.world.stepSimulation()
-            for contact in self.world.getContactPoints(self._bar.ids[0], self._cube_body):
-                normal, size, first, along, second, across = (
-                    np.array(contact[k]) for k in (7, 9, 10, 11, 12, 13)
-                )
-                force = size * normal - first * along - second * across
-                total += np.concatenate([force, np.cross(np.array(contact[5]) - tip, force)])
-        met = {body for contact in self.world.getContactPoints(self._cube_body) for body in contact[1:3]}
-        self.touched = self.touched or bool(total.any()) or not met.isdisjoint(self._tube.ids)
-        if self.options.feels:
-            mean = self.felt + self._dt / (self._dt + _RELAXATION) * (total / _WITHIN - self.felt)
-            self.felt = mean * (_MOST / max(float(np.linalg.norm(mean[:3])), _MOST))
-        _place(self.course, state, self._tube, self._bar)
-
-    def _settled(self, passes: int = _PASSES) -> State:
-        """The robot at rest under what it feels, or `HostError`. A few `passes` get there from the step
-        before; not with effects, for which each is a step in time."""
-        inputs = {**self.drive.inputs(self.q), **_load(self.felt)}
-        for _ in range(0 if self._own.robots[0].effects else passes):
-            state = self.simulator.step(**inputs)
-            if state.ok[0] and state.residual[0] < _AT_REST:
-                break
-        else:
-            state = self.simulator.settle(**inputs, tolerance=_AT_REST)
-        if not state.ok[0] or not np.isfinite(state.position).all():
-            raise HostError(f"the rod is lost: {state.problems.get(0, 'its shape is not finite')}")
-        return state
+            points = self.world.getContactPoints(self._cube_body)
+            met = {body for point in points if point[9] > 0.0 for body in point[1:3]}
+            self.touched = self.touched or not met.isdisjoint([self._bar, *self._tube.ids])
+        self._tube.place(*nodes)
 
     def _clear(self, q: Floats) -> Floats:
         """Numbers near these with which the bar does not enter the floor."""
@@ -321,7 +309,6 @@ class PushCell(Cell):
 class PushTask(HostedTask):
     """Base of Push and QuadrupedPush: three numbers move the tip, the cube goes where it is pushed."""
 
-    options_class: ClassVar[type[EnvOptions]] = PushOptions
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 5
     accuracy: float = ACCURACY
@@ -374,20 +361,19 @@ class PushTask(HostedTask):
 
     def cell(self) -> Cell:
         """A `PushCell` with this course, these options, and the robot as it is before it is randomised."""
-        options = self.options
-        assert isinstance(options, PushOptions)
-        return PushCell(self.course, self.base_robot, options, self.dt, self.picture_world)
+        return PushCell(self.course, self.base_robot, self.options, self.dt, self.picture_world)
 
 
-def _load(wrench: Floats) -> dict[str, Any]:
-    return {"tip_force": wrench[:3], "tip_moment": wrench[3:]}
+def _sound(state: State) -> State:
+    if not state.ok[0] or not np.isfinite(state.position).all():
+        raise HostError(f"the rod is lost: {state.problems.get(0, 'its shape is not finite')}")
+    return state
 
 
-def _bodies(world: Bullet, course: Course, robot: Robot) -> tuple[RodBodies, RodBodies]:
-    """Return the bodies of the robot and its bar."""
+def _capsules(world: Bullet, course: Course, robot: Robot) -> RodBodies:
+    """Return the robot's, without its bar."""
     radii = [segment.body_radius or course.thickness for segment in robot.segments for _ in range(_CAPSULES)]
-    tube = RodBodies(world, robot.length, radii, len(radii), color=(*_ROD, 1.0))
-    return tube, RodBodies(world, course.width, course.thickness, 1, color=(*_BAR, 1.0))
+    return RodBodies(world, robot.length, radii, len(radii), color=(*_ROD, 1.0))
 
 
 def _bar_nodes(course: Course, state: State) -> tuple[Floats, Floats]:
@@ -396,11 +382,6 @@ def _bar_nodes(course: Course, state: State) -> tuple[Floats, Floats]:
     return tip + 0.5 * course.width * np.array([-rotation[:, 1], rotation[:, 1]]), np.array(
         [rotation, rotation]
     )
-
-
-def _place(course: Course, state: State, tube: RodBodies, bar: RodBodies) -> None:
-    tube.place(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY])
-    bar.place(*_bar_nodes(course, state))
 
 
 def _at_most(vector: Floats, longest: float) -> Floats:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes.a1 import look, push
-from fastrod_scenes.a1.quadruped import MOUNT, neck, standing
+from fastrod_scenes.a1.quadruped import MOUNT, standing
 from fastrod_scenes.scene import SceneError
 
 
@@ -58,16 +57,3 @@ def test_neck_stands_on_the_head_with_its_axes_as_stated():
     assert np.abs(pose[:2] - np.array(trunk[0])[:2] - MOUNT[:2]).max() < 0.02
     assert max(abs(v) for v in world.getBaseVelocity(mount.body)[0]) < 0.01
     world.disconnect()
-
-
-def test_gait_of_the_neck_is_a_sine():
-    robot = neck(3, push.STRETCH)
-    stage = push.NeckPush().stage()
-    bends = SegmentActions(robot).matrix[: robot.n_tendons, 1::3]
-    for t in (0.0, 0.3, 1.1):
-        gait = stage.gait(t)
-        longer = np.cumsum(gait["extension"])[robot.tendon_segment]
-        pulled = gait["tendon_length"] - robot.rest_tendon_length - longer
-        each = np.linalg.lstsq(bends, pulled, rcond=None)[0] / stage.actions.offset
-        assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
-    stage.close()

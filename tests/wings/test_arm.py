@@ -378,10 +378,6 @@ def test_bad_input(arm, error, sentence, call):
         call(arm)
 
 
-def test_the_file_ships() -> None:
-    assert Path(ur5_path()).is_file()
-
-
 def test_load_that_fails_leaves_nothing_in_the_world():
     world = connect()
     with pytest.raises(HostError, match="has no link 'tol0'; did you mean 'tool0'"):

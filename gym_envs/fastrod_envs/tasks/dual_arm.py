@@ -12,12 +12,12 @@ from fastrod.errors import HostError
 from fastrod.hosts import Bullet, connect
 from fastrod.hosts.gripper import Gripper
 from fastrod.model.robot import Robot
-from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, short
 from fastrod_envs.hosted import Cell, HostedResult, HostedTask
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.task import Backdrop, Ball, Field, Tube, solid_box
+from fastrod_envs.tip import NOTHING
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
 HEIGHT = 0.3
@@ -39,15 +39,15 @@ EXTENSION, LARGEST_BEND = 0.03, 1.2
 """Largest extension [m] and bend [rad] of a segment, either way."""
 EXTENSION_RATE, BEND_RATE = 0.08, 2.0
 """Largest of a segment [m/s], [rad/s]."""
-SLIP = 0.004
-"""A head that is pulled so far from where it holds lets go [m]."""
+SUCTION = 0.5
+"""A head that is pulled at harder lets go [N]."""
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 _HEAD = RADIUS + 0.0025  # m
 _HOLD = _HEAD + BALL  # m, from a tip to the middle of a ball that it touches
 _FALLEN = 0.15  # m, below the bases
 _SUBSTEP, _DT = 0.05, 0.01  # s, longest step of the soft robots, of the world
-_MASS = 0.005  # kg
+_MASS, _HEAD_MASS = 0.005, 0.02  # kg
 _MOUNT = 0.5 * HEIGHT + 0.01  # m, half the height of what a robot stands out from
 _POINTS = 5
 _SIDES = (-1.0, 1.0)
@@ -65,15 +65,15 @@ class DualArm(HostedTask):
     Two robots of two segments look at each other along x. The head of the first holds the ball at the start,
     by suction; that of the second takes hold of it where it touches it and its grip is on. An action is the
     velocity of both tips along x, y, z (up to
-    0.1 m/s, by damped resolved rates) and both grips, on above 0. A head that is pulled 4 mm from where it
-    holds lets go. Start, 0.2 rad of each segment either way, and goal, 20 x 60 x 50 mm either way around (60,
+    0.1 m/s, by damped resolved rates) and both grips, on above 0. A head that is pulled at with more than
+    0.5 N lets go. Start, 0.2 rad of each segment either way, and goal, 20 x 60 x 50 mm either way around (60,
     0, 300) mm, differ from episode to episode; `difficulty` scales both.
 
     Distance: from ball to goal [m]. Success: below 10 mm, with the second robot alone holding it. Reward,
     each step: 0.2 exp(-g / 0.05 m), g from the second head to the ball; 0.3 while the second alone holds it;
     0.5 exp(-d / 0.05 m) meanwhile, d the distance; 1 for success; -1 where the ball falls or the robots touch
-    each other, which end the episode. Otherwise it has 40 steps of 0.1 s. The ball's weight does not bend the
-    robots. Baseline: both to the middle, the second from its side; then on, off, to the goal.
+    each other, which end the episode. Otherwise it has 40 steps of 0.1 s. What a head holds and meets bends
+    its robot at once. Baseline: both to the middle, the second from its side; then on, off, to the goal.
     """
 
     name = "DualArm"
@@ -186,9 +186,12 @@ class _Pair(Cell):
         b.setTimeStep(self.step)
         self.ball, self.heads = _furnish(b)
         self.commanded, self.held = [False, False], [False, False]
-        self._holds = [np.zeros(3), np.zeros(3)]
-        for soft, head in zip(self.softs, self.heads, strict=True):
-            head.place(soft.tip, quaternion_from_matrix(soft.tip_rotation))
+        weight = np.array([0.0, 0.0, -9.81 * _MASS])
+        load = np.concatenate([weight, np.cross(_HOLD * self.softs[0].tip_rotation[:, 2], weight)])
+        self._springs = [
+            soft.hold(b, head.body, self.step, own)
+            for soft, head, own in zip(self.softs, self.heads, (load, NOTHING), strict=True)
+        ]
         first = self.softs[0]
         place = first.tip + (_HOLD + 2e-4) * first.tip_rotation[:, 2]
         b.resetBasePositionAndOrientation(self.ball, place.tolist(), [0.0, 0.0, 0.0, 1.0])
@@ -210,11 +213,11 @@ class _Pair(Cell):
                 velocity = SPEED * moves[k]
                 if self.at_once:
                     to = 0.5 * (self.low[k] + self.high[k]) + 0.5 * (self.high[k] - self.low[k]) * moves[k]
-                    velocity = np.clip((to - soft.tip) / substep, -SPEED, SPEED)
+                    velocity = np.clip((to - soft.aim) / substep, -SPEED, SPEED)
                 jacobian = soft.jacobian()[:3] * soft.rate
                 rates = scaled_rates(jacobian[None], velocity[None], -soft.posture()[None])[0]
                 soft.drive(soft.action + substep * soft.rate * rates)
-            self._advance(substep)
+            self._advance()
             self._look()
             self._slip()
             if self._over():
@@ -286,7 +289,7 @@ class _Pair(Cell):
         if not self.at_once:
             moves = velocity / SPEED
         else:
-            to = np.stack([soft.tip for soft in self.softs]) + 0.1 * velocity
+            to = np.stack([soft.aim for soft in self.softs]) + 0.1 * velocity
             moves = (2.0 * to - self.low - self.high) / (self.high - self.low)
         return np.array([*moves.ravel(), *(2.0 * np.array(grasps) - 1.0)])
 
@@ -310,40 +313,29 @@ class _Pair(Cell):
     def close(self) -> None:
         self.world.disconnect()
 
-    def _advance(self, duration: float) -> None:
-        """The world's steps while the heads move to where the soft robots now have them."""
-        poses = [(soft.tip, quaternion_from_matrix(soft.tip_rotation)) for soft in self.softs]
-        for head, pose in zip(self.heads, poses, strict=True):
-            head.head_for(*pose, duration)
+    def _advance(self) -> None:
+        """The world's steps while the heads move as the soft robots hold them."""
+        for spring in self._springs:
+            spring.follow(self.n_steps)
         for _ in range(self.n_steps):
+            for spring in self._springs:
+                spring.pull()
             self.world.stepSimulation()
             self._take()
-        for head, pose in zip(self.heads, poses, strict=True):
-            head.place(*pose)
 
     def _take(self) -> None:
         """Heads that are commanded to hold, and touch the ball, hold it."""
         for k, head in enumerate(self.heads):
             if self.commanded[k] and not self.held[k] and head.attach(()) is not None:
                 self.held[k] = True
-                self._holds[k] = self._seen_from(head)
 
     def _slip(self) -> None:
-        """A head that has been pulled off lets go."""
-        off = [
-            float(np.linalg.norm(self._seen_from(head) - at)) * held
-            for head, at, held in zip(self.heads, self._holds, self.held, strict=True)
-        ]
-        worst = int(np.argmax(off))
-        if off[worst] > SLIP:
+        """A head that is pulled at too hard lets go."""
+        pull = [float(np.linalg.norm(spring.wrench[:3])) for spring in self._springs]
+        worst = int(np.argmax(np.multiply(pull, self.held)))
+        if self.held[worst] and pull[worst] > SUCTION:
             self.heads[worst].release()
             self.held[worst] = False
-
-    def _seen_from(self, head: Gripper) -> Floats:
-        """(3,) the ball in the frame of a head [m]."""
-        b = self.world
-        back = b.invertTransform(*b.getBasePositionAndOrientation(head.body))
-        return np.array(b.multiplyTransforms(*back, *b.getBasePositionAndOrientation(self.ball))[0])
 
     def _look(self) -> None:
         """Update the ball's position, and the distance of the robots from each other."""
@@ -372,4 +364,4 @@ def _furnish(b: Bullet) -> tuple[int, list[Gripper]]:
     seen = b.createVisualShape(b.GEOM_SPHERE, radius=BALL, rgbaColor=[*_YELLOW, 1.0])
     ball: int = b.createMultiBody(_MASS, shape, seen, [0.0, 0.0, HEIGHT])
     b.changeDynamics(ball, -1, linearDamping=0.0, angularDamping=0.0)
-    return ball, [Gripper(b, _HEAD, 0.0, (0.0, 0.0, 0.75, 1.0)) for _ in _SIDES]
+    return ball, [Gripper(b, _HEAD, 0.0, (0.0, 0.0, 0.75, 1.0), _HEAD_MASS) for _ in _SIDES]

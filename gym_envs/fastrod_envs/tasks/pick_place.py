@@ -50,6 +50,7 @@ _ABOVE = {"suction": 0.0, "gripper": 0.003}  # m, least from the head to the top
 _HIGH = 0.16  # m, of the tip's range above that
 _RANGE = ((0.36, 0.64), (-0.26, 0.26))  # m, of the tip in x and y
 _SUBSTEP, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
+_HEAD_MASS = 0.05  # kg
 _MASS, _TABLE = 0.05, ((0.5, 0.0, TOP - 0.01), (0.2, 0.32, 0.01))  # kg; middle and half size
 # world_from_tip without weight; it bends toward d1, world -y
 _DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -82,8 +83,10 @@ class PickPlace(HostedTask):
     0.02 m/s. Reward, each step: 0.2 exp(-g / 0.05 m), g from the tip to where it grasps the cube, or 0.2 once
     the cube is held or lies on the spot; 0.3 while it is held or lies there; 0.5 exp(-d / 0.1 m) - 0.5
     exp(-d0 / 0.1 m), d the distance, d0 that at the start; 1 for success; -1 where the cube falls from the
-    table, which ends the episode. Otherwise it has 60 steps of 0.1 s. The cube does not bend the soft robot.
-    Baseline: down where it is above the cube, up, across, down where the cube is above the spot, off.
+    table, which ends the episode. Otherwise it has 60 steps of 0.1 s. The cube bends the soft robot, and
+    swings on it.
+    Baseline: down where it is above the cube, up, across, down where the cube would hang at rest above the
+    spot, off.
     """
 
     name = "PickPlace"
@@ -219,8 +222,7 @@ class _Table(Cell):
         self.cube, _, self.gripper = _furnish(b, self.width)
         b.resetBasePositionAndOrientation(self.cube, [*start, z], [0.0, 0.0, 0.0, 1.0])
         self.commanded = self.held = False
-        self._head = self.soft.tip, quaternion_from_matrix(self.soft.tip_rotation)
-        self.gripper.place(*self._head)
+        self.spring = self.soft.hold(b, self.gripper.body, self.step)
         self._look()
         self._first = float(np.linalg.norm(self.place - self.spot))
 
@@ -237,7 +239,7 @@ class _Table(Cell):
         self._command(bool(action[4] > 0.0))
         for _ in range(self.n_substeps):
             if self.at_once:
-                velocity = np.clip((to - self.soft.tip) / substep, -SPEED, SPEED)
+                velocity = np.clip((to - self.soft.aim) / substep, -SPEED, SPEED)
                 bend_rate = min(max((bend - self.bend) / substep, -BEND_RATE), BEND_RATE)
             self._move(velocity, bend_rate, substep)
         self._look()
@@ -292,7 +294,8 @@ class _Table(Cell):
             low = -float(left[2])
             want = min(LIFT, 3.0 * max(0.0, aside - 0.006))
             gate = min(1.0, max(0.0, low) / (0.5 * want + 1e-3))
-            velocity = np.array([left[0] * gate, left[1] * gate, want - PRESS - low])
+            over = self.spot - self.soft.aim
+            velocity = np.array([over[0] * gate, over[1] * gate, want - PRESS - low])
             grip = max((aside - 0.01) / 0.004, (low - 0.004) / 0.003)
         elif aside < 0.015:
             velocity, grip = np.array([0.0, 0.0, LIFT]), -1.0
@@ -308,7 +311,7 @@ class _Table(Cell):
         bend_rate = min(max(-2.0 * self.bend, -BEND_RATE), BEND_RATE)
         if not self.at_once:
             return np.array([*velocity / SPEED, bend_rate / BEND_RATE, grip])
-        to = 2.0 * (self.soft.tip + 0.1 * velocity - self.low) / (self.high - self.low) - 1.0
+        to = 2.0 * (self.soft.aim + 0.1 * velocity - self.low) / (self.high - self.low) - 1.0
         return np.array([*to, (self.bend + 0.1 * bend_rate) / BEND, grip])
 
     def backdrop(self) -> Backdrop:
@@ -344,7 +347,7 @@ class _Table(Cell):
 
     def _move(self, velocity: Floats, bend_rate: float, duration: float) -> None:
         """One step of arm and soft robot, and those of the world meanwhile."""
-        tip = self.soft.tip
+        tip = self.soft.aim
         displacement = np.clip(tip + duration * velocity, self.low, self.high) - tip
         length = self.soft.actions.robot.length
         before = _flange(np.zeros(3), self.bend, length)[:3]
@@ -356,15 +359,13 @@ class _Table(Cell):
         self.flange = np.concatenate([at, wanted[3:]])
         self._follow()
         self.soft.drive(self._action(), self._base())
-        head = self.soft.tip, quaternion_from_matrix(self.soft.tip_rotation)
-        self.gripper.head_for(*head, duration)
+        self.spring.follow(self.n_steps)
         for _ in range(self.n_steps):
             self.gripper.drive(self.step)
+            self.spring.pull()
             self.world.stepSimulation()
             if self.commanded and not self.held and not self.width:
                 self.held = self.gripper.attach(()) is not None
-        self.gripper.place(*head)
-        self._head = head
 
     def _follow(self) -> None:
         """The joints, by resolved rates toward the flange's pose."""
@@ -419,7 +420,7 @@ class _Table(Cell):
         b.resetBasePositionAndOrientation(
             self.shown_spot, [*self.spot[:2], TOP + 0.0002], [0.0, 0.0, 0.0, 1.0]
         )
-        self.shown_gripper.place(*self._head)
+        self.shown_gripper.place(self.soft.tip, quaternion_from_matrix(self.soft.tip_rotation))
         for finger in self.gripper.fingers:
             b.resetJointState(
                 self.shown_gripper.body, finger, self.world.getJointState(self.gripper.body, finger)[0]
@@ -462,4 +463,4 @@ def _furnish(b: Bullet, width: float) -> tuple[int, int, Gripper]:
     b.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     disc = b.createVisualShape(b.GEOM_CYLINDER, radius=0.03, length=0.001, rgbaColor=[*_GREEN, 1.0])
     spot: int = b.createMultiBody(0.0, -1, disc, [0.5, 0.0, TOP + 0.0002])
-    return cube, spot, Gripper(b, _HEAD, width, (0.0, 0.0, 0.75, 1.0))
+    return cube, spot, Gripper(b, _HEAD, width, (0.0, 0.0, 0.75, 1.0), _HEAD_MASS)

@@ -38,12 +38,11 @@ class Push(PushTask):
     Reward: exp(-50 d^2), and 0.5 once the robot has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
     and does not end before.
-    Baseline: as in QuadrupedPush; it ends within a centimetre, farthest off for
-    goals at the side, where the bar slips.
+    Baseline: as in QuadrupedPush.
 
     The paper's goals (x 0.1 to 0.2 m, y -0.3 to 0.3 m) lie mostly beside the cube, where a robot that stands
-    behind it cannot push it in an episode; here they lie in front of it, and the bar is new. What is left out
-    is as in QuadrupedPush.
+    behind it cannot push it in an episode; here they lie in front of it, and the bar is new: it bends its
+    robot as in QuadrupedPush.
     """
 
     name = "Push"

@@ -49,14 +49,13 @@ class QuadrupedPush(PushTask):
     Reward: exp(-300 d^2), and 0.5 once the neck has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
     and does not end before.
-    Baseline: the tip goes straight along the way that the cube has to go, by damped
-    resolved rates with the simulator's Jacobian. The cube stays on the bar; it ends within a few millimetres.
+    Baseline: straight to the cube, then the tip goes straight along the way that the cube has to go, by
+    damped resolved rates with the simulator's Jacobian. The cube stays on the bar.
 
-    What is left out: the trunk stands still (a push of 0.12 N does not move 12 kg), so the legs are drawn
-    only, and the bar has no weight. The bar pushes the cube as it moves; with the option `feels` the neck
-    bends under what the bar felt, 0.3 s later. A rod that touches the cube within steps of 10 ms
-    (`MountedRod(contact_bodies=...)`) costs ten times as much, and its round tip does not steer a cube. A
-    controller keeps the bar off the floor.
+    The bar is a body of 20 g at the tip of the neck, which is its spring: it bends in the step in which the
+    cube, or the floor, pushes the bar. The bar has no weight. The trunk stands still (a push of 0.12 N does
+    not move 12 kg), so the legs are drawn only. A round tip does not steer a cube. A controller keeps the bar
+    off the floor.
     """
 
     name = "QuadrupedPush"
