@@ -90,19 +90,19 @@ class Tip:
         self._lifted = bullet.getDynamicsInfo(body, -1)[0]
 
     def solve(self, **inputs: Any) -> State:
-        """Return the rod at rest under these inputs and what the body did since it was last solved. Several
-        passes get there; with effects one is a step in time, and the rest settles."""
+        """Return the rod at rest under these inputs and what the body did since it was last solved."""
         if self._felt:
             self.wrench = np.mean(self._felt, axis=0)
             self.wrench *= _MOST / max(float(np.linalg.norm(self.wrench[:3])), _MOST)
             self._felt = []
         inputs |= {"tip_force": self.wrench[:3], "tip_moment": self.wrench[3:]}
-        effects = bool(self.simulator.robots[0].effects)
-        for _ in range(1 if effects else _PASSES):
+        if self.simulator.robots[0].effects:  # for which each call is a step in time
+            return self.simulator.settle(**inputs, tolerance=_AT_REST)
+        for _ in range(_PASSES):
             state = self.simulator.step(**inputs)
             if state.ok[0] and state.residual[0] < _AT_REST:
-                return state
-        return self.simulator.settle(**inputs, tolerance=_AT_REST) if effects else state
+                break
+        return state
 
     def deflection(self) -> Floats:
         """(6,) displacement of the tip [m] and its rotation by what it was last solved under, to first

@@ -241,18 +241,6 @@ def test_asking_moves_nothing(world: Bullet, arm: BulletArm) -> None:
     assert seen() == before
 
 
-def test_two_worlds(world: Bullet, arm: BulletArm) -> None:
-    other = connect()
-    try:
-        second = BulletArm.load(other, ur5_path(), tip="tool0", position=(1.0, 0.0, 0.0))
-        second.place(POSES["low"])
-        assert_array_equal(arm.position(), np.zeros(6))
-        assert_allclose(second.frame(np.zeros(6)) - arm.frame(np.zeros(6)), [1, 0, 0, 0, 0, 0, 0], atol=1e-15)
-    finally:
-        other.disconnect()
-    assert arm.frame(np.zeros(6)).shape == (7,)
-
-
 def test_the_base_may_move(world: Bullet, arm: BulletArm) -> None:
     before = arm.frame(POSES["low"])
     x, y, z = world.getBasePositionAndOrientation(arm.body)[0]

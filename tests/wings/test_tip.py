@@ -1,5 +1,7 @@
 """`Tip`: a body at a rod's tip weighs, swings and is held as the rod's statics have it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -20,8 +22,8 @@ STEP, WITHIN, ARM = 0.01, 5, 0.03  # s, steps of the world in one of the rod, m 
 class Held:
     """A rod that stands out sideways with a ball at its tip, and maybe a cube fixed to that."""
 
-    def __init__(self, ball, cube=0.0, gravity=9.81):
-        robot = soft_robot("rod", 2, line_density=0.03)
+    def __init__(self, ball, cube=0.0, gravity=9.81, effects=()):
+        robot = replace(soft_robot("rod", 2, line_density=0.03), effects=effects)
         actions = SegmentActions(robot)
         self.inputs = {"base_pose": (0.0, 0.0, 0.5, 0.5**0.5, 0.0, 0.5**0.5, 0.0)}
         self.inputs |= actions.inputs(np.ravel([(0.0, 0.3 * offset, 0.0) for offset in actions.offset]))
@@ -85,3 +87,12 @@ def test_a_ball_without_weight_swings_at_its_frequency_and_comes_to_rest_where_i
     crossings = np.flatnonzero(np.diff(np.sign(y[5:])))
     assert np.diff(crossings[:4]).mean() * STEP == pytest.approx(np.pi / rate, rel=0.1)
     assert np.abs(y[-20:]).max() < 0.05 * np.abs(y).max()
+
+
+def test_effects_pass_with_the_time_of_the_rod():
+    held = Held(0.05, gravity=0.0, effects=({"name": "latency", "delay": 2 * WITHIN * STEP},))
+    before = held.run(1)[-1]
+    held.inputs["tendon_length"] = held.inputs["tendon_length"] + 1e-3 * np.resize([0, 1, 0, -1], 8)
+    moved = np.abs(held.run(3)[WITHIN - 1 :: WITHIN] - before).max(axis=1)
+    assert moved[1] < 1e-5
+    assert moved[2] > 1e-3
