@@ -254,6 +254,7 @@ WRONG = {
     "": "give --bus INTERFACE:CHANNEL or --emulate, and not both",
     "fly --emulate": "no action 'fly' of fastrod drive; known: excite",
     "trak --emulate": "did you mean 'track'?",
+    "--seed loop --emulate": "--seed: 'loop' is not a whole number",
     "track --emulate --bus socketcan:can0": "give --bus INTERFACE:CHANNEL or --emulate, and not both",
     "track --emulate --path hexagon": "no path 'hexagon'; known: circle, square, triangle.",
     "track --emulate --policy nowhere": "'nowhere' holds no policy",

@@ -23,6 +23,7 @@ from fastrod.commands.parser import (
     add_command,
     add_group,
     call,
+    flags,
     unknown_option,
 )
 from fastrod.commands.terminal import (
@@ -87,12 +88,14 @@ def _with_action(words: list[str]) -> list[str]:
         return words
     if rest and not rest[0].startswith("-"):
         raise UsageError(f"no action {rest[0]!r} of fastrod {command}; {nearest(rest[0], group.functions)}")
-    action = next((word for word in rest if word in group.functions), group.default)
-    if not action:
+    alone = flags(group)
+    for at, word in enumerate(rest):
+        before = rest[at - 1] if at else ""
+        if word in group.functions and (before in alone or "=" in before or not before.startswith("-")):
+            return [command, word, *rest[:at], *rest[at + 1 :]]
+    if not group.default:
         raise UsageError(f"fastrod {command} needs an action; {nearest('', group.functions)}")
-    if action in rest:
-        rest.remove(action)
-    return [command, action, *rest]
+    return [command, group.default, *rest]
 
 
 def demo(*, out: Path | None = None, seed: int | None = None, no_view: bool = False) -> int:

@@ -55,6 +55,12 @@ class Actions:
     epilog: str = ""
 
 
+def flags(group: Actions) -> set[str]:
+    """Return the options of its actions that take no value."""
+    words = [word for function in group.functions.values() for word in _words(function)]
+    return {_flag(one) for one, _, hint in words if hint is bool}
+
+
 def add_group(commands: Any, name: str, group: Actions) -> None:
     """Add a command with actions to `commands`, subparsers of argparse."""
     parser = commands.add_parser(
@@ -84,7 +90,7 @@ def add_command(commands: Any, name: str, function: Command, more: Mapping[str, 
         lines += (inspect.getdoc(document) or "").splitlines()
     said = _said(lines)
     for one, _, hint in words:
-        flag = f"--{one.name.rstrip('_').replace('_', '-')}"
+        flag = _flag(one)
         positional = one.kind not in (one.KEYWORD_ONLY, one.VAR_KEYWORD)
         key = next((word for word in said if word.isupper()), "") if positional else flag
         values, meaning = said.pop(key, ((), ""))
@@ -149,6 +155,10 @@ def _words(function: Command) -> Iterator[tuple[inspect.Parameter, Any, Any]]:
                 yield word, hint, _plain(inner[field.name])
         elif one.kind is not one.VAR_KEYWORD:
             yield one, None, _plain(hint)
+
+
+def _flag(word: inspect.Parameter) -> str:
+    return f"--{word.name.rstrip('_').replace('_', '-')}"
 
 
 def _plain(hint: Any) -> Any:
