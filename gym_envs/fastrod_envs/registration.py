@@ -50,7 +50,7 @@ _TASKS: dict[str, TaskEntry] = {
     "BoxExplore": TaskEntry("fastrod_envs.tasks.box_explore:BoxExplore", 40, 34.0),
     "Catch": TaskEntry("fastrod_envs.tasks.catch:Catch", 40, 5.0),
     "DualArm": TaskEntry("fastrod_envs.tasks.dual_arm:DualArm", 40),
-    "PickPlace": TaskEntry("fastrod_envs.tasks.pick_place:PickPlace", 60, 66.0),
+    "PickPlace": TaskEntry("fastrod_envs.tasks.pick_place:PickPlace", 60, 63.0),
     "Push": TaskEntry("fastrod_envs.tasks.push:Push", 40, 47.0),
     "QuadrupedPush": TaskEntry("fastrod_envs.tasks.quadruped_push:QuadrupedPush", 40, 41.0),
     "Reach": TaskEntry("fastrod_envs.tasks.reach:Reach", 40, 31.0),

@@ -51,6 +51,7 @@ _HIGH = 0.16  # m, of the tip's range above that
 _RANGE = ((0.36, 0.64), (-0.26, 0.26))  # m, of the tip in x and y
 _SUBSTEP, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
 _HEAD_MASS = 0.05  # kg
+_CALM = 0.625  # of the baseline's pace: across, for what hangs swings
 _MASS, _TABLE = 0.05, ((0.5, 0.0, TOP - 0.01), (0.2, 0.32, 0.01))  # kg; middle and half size
 # world_from_tip without weight; it bends toward d1, world -y
 _DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -85,8 +86,7 @@ class PickPlace(HostedTask):
     exp(-d0 / 0.1 m), d the distance, d0 that at the start; 1 for success; -1 where the cube falls from the
     table, which ends the episode. Otherwise it has 60 steps of 0.1 s. The cube bends the soft robot, and
     swings on it.
-    Baseline: down where it is above the cube, up, across, down where the cube would hang at rest above the
-    spot, off.
+    Baseline: down where it is above the cube, up, across, down where the cube is above the spot, off.
     """
 
     name = "PickPlace"
@@ -294,8 +294,7 @@ class _Table(Cell):
             low = -float(left[2])
             want = min(LIFT, 3.0 * max(0.0, aside - 0.006))
             gate = min(1.0, max(0.0, low) / (0.5 * want + 1e-3))
-            over = self.spot - self.soft.aim
-            velocity = np.array([over[0] * gate, over[1] * gate, want - PRESS - low])
+            velocity = np.array([*(_CALM * gate * left[:2]), want - PRESS - low])
             grip = max((aside - 0.01) / 0.004, (low - 0.004) / 0.003)
         elif aside < 0.015:
             velocity, grip = np.array([0.0, 0.0, LIFT]), -1.0
