@@ -87,7 +87,7 @@ class Tip:
             self._inertia += mass * by.T @ by
             self._inertia[3:, 3:] += axes @ np.diag(diagonal) @ axes.T
             self._lever = self._lever + mass * np.array(at)
-        self._lifted = bullet.getDynamicsInfo(body, -1)[0]
+        self._lifted, self._compliance = bullet.getDynamicsInfo(body, -1)[0], self._symmetric()
 
     def solve(self, **inputs: Any) -> State:
         """Return the rod at rest under these inputs and what the body did since it was last solved."""
@@ -112,8 +112,7 @@ class Tip:
     def follow(self, n_steps: int) -> None:
         """Be held by the rod as it is solved now, from so many steps of the world on; evenly more until
         then."""
-        self._compliance = self.simulator.compliance(moments=True)[0]
-        self._compliance = 0.5 * (self._compliance + self._compliance.T)
+        self._compliance = self._symmetric()
         self._by = displacement(self._pose, self._seated()) / n_steps
         self._more = (self.wrench - self._load) / n_steps
 
@@ -139,6 +138,11 @@ class Tip:
         given[:3] -= self._lifted * self._gravity
         bullet.applyExternalForce(self._body, -1, given[:3].tolist(), position, bullet.WORLD_FRAME)
         bullet.applyExternalTorque(self._body, -1, given[3:].tolist(), bullet.WORLD_FRAME)
+
+    def _symmetric(self) -> Floats:
+        """(6, 6) compliance of the tip; what a moment skews is left out."""
+        compliance = self.simulator.compliance(moments=True)[0]
+        return np.asarray(0.5 * (compliance + compliance.T))
 
     def _seated(self) -> Floats:
         """(7,) pose of the body where the rod has it."""
