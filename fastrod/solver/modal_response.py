@@ -144,9 +144,8 @@ def full_newton(
         if not len(some := rows[~ended]):
             break
         found = modal.derive(some, ports, q, wanted=wanted, step=step)
-        change = np.linalg.solve(stiffness(found, ports.tip_moment)[some], found.gradient[some][:, :, None])[
-            :, :, 0
-        ]
+        matrix = stiffness(found, ports.tip_moment)[some]
+        change = np.linalg.solve(matrix, found.gradient[some][:, :, None])[:, :, 0]
         largest = np.abs(change).max(axis=1, initial=0.0)
         q[some] -= change
         ended[~ended] = largest <= _LAST * np.maximum(1.0, np.abs(q[some]).max(axis=1, initial=0.0))

@@ -20,8 +20,8 @@ from fastrod_envs.tip import NOTHING, UNLOADED, Tip
 
 @final
 class SoftArm:
-    """One soft robot, driven by the actions of `SegmentActions`, on a base that is where it is told. What it
-    feels is what its `head` meets."""
+    """One soft robot, driven by the actions of `SegmentActions`, on a base that others move. What it feels is
+    what its `head` meets."""
 
     def __init__(
         self,
@@ -100,11 +100,11 @@ class SoftArm:
 
     def hold(self, bullet: Bullet, body: int, dt: float, load: Floats = NOTHING) -> Tip:
         """Rest under `load` (6,), and hold a body at the tip from now on in a world of steps of `dt` [s]
-        (`Tip.hold`)."""
-        given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
-        self._keep(self.simulator.settle(**given, tip_force=load[:3], tip_moment=load[3:]))
-        self.head = Tip(self.simulator, dt)
-        self.head.hold(bullet, body, np.eye(3), load)
+        (`Tip`)."""
+        if load.any():
+            given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
+            self._keep(self.simulator.settle(**given, tip_force=load[:3], tip_moment=load[3:]))
+        self.head = Tip(self.simulator, dt, bullet, body, np.eye(3), load)
         return self.head
 
     def drive(self, action: Floats, base: Floats | None = None) -> None:

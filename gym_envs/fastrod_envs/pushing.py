@@ -271,8 +271,7 @@ class PushCell(Cell):
             world.setCollisionFilterPair(self._bar, body, -1, -1, 0)
         state = self.simulator.state
         self._tube.place(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY])
-        self.tip_body = Tip(self.simulator, self._dt / _WITHIN)
-        self.tip_body.hold(world, self._bar, _SEAT)
+        self.tip_body = Tip(self.simulator, self._dt / _WITHIN, world, self._bar, _SEAT)
 
     def _move(self, state: State) -> None:
         """Bring capsules and bar there within a step of the rod."""

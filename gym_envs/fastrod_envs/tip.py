@@ -45,29 +45,20 @@ class Tip:
     second. It is stable at any stiffness, and while what the body holds weighs no more than twice as much.
     """
 
-    def __init__(self, simulator: Simulator, dt: float) -> None:
-        """`simulator` of one robot; `dt` of the world's steps [s]."""
-        self.simulator, self.dt = simulator, dt
+    def __init__(
+        self, simulator: Simulator, dt: float, bullet: Bullet, body: int, seat: Floats, load: Floats = NOTHING
+    ) -> None:
+        """Put a body at the tip of the robot of `simulator`, which is at rest under `load` (6,), the wrench
+        of what the body will hold: at rest and turned by `seat` (3, 3) tip_from_body. Its base weighs
+        nothing, for it stands for the rod's own mass, which weighs in the rod; its links weigh. `dt` of the
+        world's steps [s]."""
+        self.simulator, self.dt, self._bullet, self._body, self._seat = simulator, dt, bullet, body, seat
         self._damping = max(s.damping_time for s in simulator.robots[0].segments) or _DAMPING
-        self.wrench: Floats = np.zeros(6)
+        self.wrench: Floats = load
         """(6,) of the body on the rod, under which it was solved: force [N] and moment about the tip [N m],
         world."""
-        self._bullet: Bullet
-        self._body = -1
-        self._seat: Floats = np.eye(3)
-        self._gravity, self._lever, self._inertia = np.zeros(3), np.zeros(3), np.eye(6)
-        self._lifted = 0.0
-        self._pose, self._by, self._load = np.zeros(7), np.zeros(6), np.zeros(6)
-        self._more, self._compliance = np.zeros(6), np.eye(6)
-        self._besides, self._expected = np.zeros(6), np.zeros(6)
         self._felt: list[Any] = []
-
-    def hold(self, bullet: Bullet, body: int, seat: Floats, load: Floats = NOTHING) -> None:
-        """Put a body at the tip of a rod that is at rest under `load` (6,), the wrench of what the body will
-        hold: at rest and turned by `seat` (3, 3) tip_from_body. Its base weighs nothing, for it stands for
-        the rod's own mass, which weighs in the rod; its links weigh."""
-        self._bullet, self._body, self._seat, self._felt = bullet, body, seat, []
-        self.wrench, self._load, self._pose = load, load, self._seated()
+        self._load, self._pose, self._by, self._more = load, self._seated(), np.zeros(6), np.zeros(6)
         self._besides, self._expected = load.copy(), np.zeros(6)
         position, orientation = self._pose[:3].tolist(), to_xyzw(self._pose[3:]).tolist()
         bullet.resetBasePositionAndOrientation(body, position, orientation)

@@ -97,16 +97,8 @@ def test_modes_and_observer_come_to_the_same_rest(name: str) -> None:
         assert_allclose(modal.arclength, observer.arclength, rtol=0, atol=1e-12)
 
 
-ANSWERS = [
-    "tip force",
-    "tip moment",
-    "follower",
-    "two segments",
-    "point forces",
-    "longer",
-    "tension",
-    "bent at rest",
-]
+ANSWERS = ["tip force", "tip moment", "follower", "two segments", "point forces", "longer", "tension"]
+ANSWERS += ["bent at rest"]
 
 
 @pytest.mark.parametrize("name", ANSWERS)
@@ -116,7 +108,8 @@ def test_modes_and_observer_answer_alike(name: str) -> None:
     for kind in (Observer(), Modal(modes=Modes(6, 4, pieces=3))):
         sim = Simulator(robot, 3, points_per_segment=40, solver=kind)
         sim.settle(**inputs_of(robot, given))
-        found.append((sim.jacobian(turning=True), sim.compliance(moments=True)))
+        compliance = sim.compliance(moments=True)
+        found.append((sim.jacobian(turning=True), compliance[..., :3], compliance[..., 3:]))
     for modal, observer in zip(found[1], found[0], strict=True):
         assert_allclose(modal, observer, rtol=0, atol=3e-6 * np.abs(observer).max())
 

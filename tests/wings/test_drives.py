@@ -14,7 +14,7 @@ from fastrod_device.can.bus import open_bus
 from fastrod_device.can.clock import SteppedClock, WallClock
 from fastrod_device.can.dictionary import object_dictionary
 from fastrod_device.can.drive import DriveBus
-from fastrod_device.can.faultcodes import STATUS_BITS, state_in_words
+from fastrod_device.can.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
 from fastrod_device.can.pacer import Pacer, urgently
 from fastrod_device.emulator.nodes import EmulatedDrives
 from fastrod_device.errors import DeviceError
@@ -431,6 +431,12 @@ def test_an_own_dictionary_takes_the_place_of_ours(tmp_path):
 def test_states_and_their_statuswords(state):
     assert state_in_words(STATUS_BITS[state]) == state
     assert state_in_words(STATUS_BITS[state] | 0x9610) == state  # voltage, remote, target reached, ...
+
+
+def test_codes_in_words():
+    assert all(in_words(code).startswith(words) for code, words in CODES.items())
+    assert in_words(0x8199) == "communication (0x8199)"
+    assert in_words(0xEE00) == "unknown error (0xEE00)"
 
 
 def test_counts_and_torques_go_round():

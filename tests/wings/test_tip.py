@@ -30,8 +30,8 @@ class Held:
         self.rod = Simulator(robot, dt=STEP * WITHIN, points_per_segment=10, threads=1)
         state = self.rod.settle(**self.inputs, **UNLOADED)
         self.world = connect(dt=STEP, gravity=(0.0, 0.0, -gravity))
-        self.ball, self.tip = self._body(ball), Tip(self.rod, STEP)
-        self.tip.hold(self.world, self.ball, np.eye(3))
+        self.ball = self._body(ball)
+        self.tip = Tip(self.rod, STEP, self.world, self.ball, np.eye(3))
         self.cube, rotation = self._body(max(cube, 1e-9)), state.tip_rotation[0]
         at = state.tip_position[0] + ARM * rotation[:, 2]
         self.world.resetBasePositionAndOrientation(

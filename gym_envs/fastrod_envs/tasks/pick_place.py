@@ -51,7 +51,7 @@ _HIGH = 0.16  # m, of the tip's range above that
 _RANGE = ((0.36, 0.64), (-0.26, 0.26))  # m, of the tip in x and y
 _SUBSTEP, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
 _HEAD_MASS = 0.05  # kg
-_CALM = 0.625  # of the baseline's pace: across, for what hangs swings
+_CALM = 0.625  # of the baseline's pace, across with the cube, which swings
 _MASS, _TABLE = 0.05, ((0.5, 0.0, TOP - 0.01), (0.2, 0.32, 0.01))  # kg; middle and half size
 # world_from_tip without weight; it bends toward d1, world -y
 _DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
