@@ -62,12 +62,12 @@ class DualArm(HostedTask):
     """Pass a ball from one soft robot to the other, which brings it to a goal that the first one cannot
     reach.
 
-    Two robots of two segments look at each other along x. The head of the first holds the ball at the start,
-    by suction; that of the second takes hold of it where it touches it and its grip is on. An action is the
-    velocity of both tips along x, y, z (up to
-    0.1 m/s, by damped resolved rates) and both grips, on above 0. A head that is pulled at with more than
-    0.5 N lets go. Start, 0.2 rad of each segment either way, and goal, 20 x 60 x 50 mm either way around (60,
-    0, 300) mm, differ from episode to episode; `difficulty` scales both.
+    Two robots of two segments look at each other along x. The head of the first holds the ball at the
+    start, by suction; that of the second takes hold of it where it touches it and its grip is on. An
+    action is the velocity of both tips along x, y, z (up to 0.1 m/s, by damped resolved rates) and both
+    grips, on above 0. A head that is pulled at with more than 0.5 N lets go. Start, 0.2 rad of each
+    segment either way, and goal, 20 x 60 x 50 mm either way around (60, 0, 300) mm, differ from episode
+    to episode; `difficulty` scales both.
 
     Distance: from ball to goal [m]. Success: below 10 mm, with the second robot alone holding it. Reward,
     each step: 0.2 exp(-g / 0.05 m), g from the second head to the ball; 0.3 while the second alone holds it;

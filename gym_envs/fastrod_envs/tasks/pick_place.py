@@ -72,13 +72,13 @@ class PickPlaceOptions(EnvOptions):
 class PickPlace(HostedTask):
     """Pick a cube from a table and put it on a spot, with a soft robot on a UR5.
 
-    An action is what an operator gives: velocity of the tip along x, y, z (up to 0.25 m/s), rate of the soft
-    robot's bend (up to
-    1 rad/s), and the grip, on above 0. The UR5's joints follow by resolved rates, so that the tip moves as
-    told while the soft robot bends and looks down; the robot's own weight, which arm and operator do not
-    reckon with, moves it aside by some millimetres. The tip stays above a cube that lies on the table. Cube
-    and spot differ from episode to episode by 8 cm in x and 7 cm in y each way, and the bend at the start by
-    0.3 rad; with `difficulty` from 1 to 0 both come to the middle, 8 cm apart.
+    An action is what an operator gives: velocity of the tip along x, y, z (up to 0.25 m/s), rate of the
+    soft robot's bend (up to 1 rad/s), and the grip, on above 0. The UR5's joints follow by resolved
+    rates, so that the tip moves as commanded while the soft robot bends and looks down; the robot's own
+    weight, which arm and operator do not reckon with, moves it aside by some millimetres. The tip stays
+    above a cube that lies on the table. Cube and spot differ from episode to episode by 8 cm in x and 7
+    cm in y each way, and the bend at the start by 0.3 rad; with `difficulty` from 1 to 0 both come to the
+    middle, 8 cm apart.
 
     Distance: of the cube's middle from where it is to lie [m]. Success: below 20 mm, released, slower than
     0.02 m/s. Reward, each step: 0.2 exp(-g / 0.05 m), g from the tip to where it grasps the cube, or 0.2 once

@@ -40,11 +40,10 @@ class QuadrupedPush(PushTask):
     """Push a cube over the floor to a goal with the soft neck of a Unitree A1 that stands: goals x 0.55 to
     0.7 m, y -0.1 to 0.1 m.
 
-    The neck has three segments of 0.14 m, which become 40 mm shorter or 50 mm longer, and a bar across its
-    tip, 80 mm wide; the paper's has none. Three numbers drive all segments alike: extension and bends toward
-    d1 (up) and d2 (right). The cube, 80 mm and
-    50 g, begins within 1 cm of (0.42, 0) m in x and in y, turned by up to 0.1 rad. It slides with friction
-    0.25 on the floor and 1 on the bar.
+    The neck has three segments of 0.14 m, which become 40 mm shorter or 50 mm longer, and a bar across
+    its tip, 80 mm wide; the paper's has none. Three numbers drive all segments alike: extension and bends
+    toward d1 (up) and d2 (right). The cube, 80 mm and 50 g, begins within 1 cm of (0.42, 0) m in x and in
+    y, turned by up to 0.1 rad. It slides with friction 0.25 on the floor and 1 on the bar.
 
     Reward: exp(-300 d^2), and 0.5 once the neck has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
