@@ -37,12 +37,12 @@ def robot() -> Robot:
 
 
 @cache
-def sealed(effect: str, outliers: float = 0.0) -> tuple[RunLog, plant.Seal]:
+def sealed(effect: Any, outliers: float = 0.0, seed: int = SEED) -> tuple[RunLog, plant.Seal]:
     """The designed run, 195 s at 15 Hz, driven by the plant; noise 0.3 mm an axis."""
-    log = excitation(robot(), seed=SEED).log
+    log = excitation(robot(), seed=seed).log
     assert log.payload is not None
     assert log.base_quaternion is not None
-    seal = plant.draw(SEED, effect)
+    seal = plant.draw(seed, effect)
     inputs = plant.Inputs(log.t, log.dl, log.payload, log.base_quaternion)
     return replace(log, tip_position=plant.measure(inputs, seal, outliers=outliers)), seal
 
@@ -73,6 +73,19 @@ def test_a_hidden_effect_is_named_and_leaves_the_noise(effect: str) -> None:
     assert result.train.after < 1.15 * result.noise.floor
     assert result.effects[0].held_out_gain > 0.9
     assert effect.replace("_", " ") in result.summary
+
+
+PAIRS = {52010: ("tendon_stretch", "axial_compression"), 52000: ("axial_compression", "marker_offset")}
+
+
+@pytest.mark.study(beyond=1)
+@pytest.mark.parametrize("seed", PAIRS)
+def test_of_two_hidden_effects_neither_is_lost(seed: int) -> None:
+    """A spring at the tip stood in for the first two; of the others the smaller passed for a correction of
+    the larger one's form."""
+    result = identify(sealed(PAIRS[seed], seed=seed)[0], robot(), threads=1)
+    assert {effect.name for effect in result.effects} == {*PAIRS[seed]}
+    assert result.test.after < 1.1 * result.noise.floor
 
 
 @pytest.mark.study
@@ -135,10 +148,9 @@ def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
 def test_the_identified_robot_predicts_what_the_report_says(effect: str, tmp_path: Path) -> None:
     """Written, read and replayed: the error on held-out rows is `after`, to the rod's step of settling."""
     result = found(effect)
-    paths = {path.name: path for path in report.write(result, tmp_path)}
-    again = load_robot(paths["identified.toml"])
-    names = [[table["name"] for table in each.effects] for each in (again, result.identified)]
-    assert names[0] == names[1]
+    again = load_robot(next(p for p in report.write(result, tmp_path) if p.name == "identified.toml"))
+    one, two = ([table["name"] for table in each.effects] for each in (again, result.identified))
+    assert one == two
     played = replay(sealed(effect)[0], again)
     rms = np.sqrt((played.residual[result.tested] ** 2).sum(1).mean())
     assert rms == pytest.approx(result.test.after, rel=0.01)

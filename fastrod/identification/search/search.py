@@ -22,6 +22,7 @@ from fastrod.identification.search.alternatives import AlternativePattern, alter
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
 from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
+    AT_NOISE,
     BIC_ACCEPT,
     BIC_KEEP,
     BIC_RIVAL,
@@ -71,7 +72,6 @@ _LOST = 5.0  # times the own loss of a block that others predict
 _FEW_LOST = 0.01  # of the samples
 MOST_OF = 0.5  # of what the best takes away: an effect that takes less is no rival by its blocks alone
 _AS_WELL = 1.05  # of a held-out loss
-_AS_NOISE = 1.15**2  # of the loss of noise alone: up to this nothing is missing
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
 _REFINED = 6  # candidates that are solved exactly at each stage
@@ -587,7 +587,7 @@ class Search:
         it bends to many a compound of other effects, which is then not found."""
         assert candidate.state is not None
         left, noise = float(candidate.state.losses.sum()), self._noise_loss(candidate)
-        return bool(trait(get_effect(candidate.name), "feels_tip")) and left > _AS_NOISE * noise
+        return bool(trait(get_effect(candidate.name), "feels_tip")) and left > AT_NOISE * noise
 
     def _noise_loss(self, of: Candidate) -> float:
         """Return what noise alone leaves of a candidate's held-out loss."""
@@ -632,7 +632,7 @@ class Search:
                 variance = float((self.target.sigma**2).mean())
                 small = (
                     fewer.fit.loss - state.fit.loss
-                ) * variance < least and fewer.fit.loss * variance < _AS_NOISE * noise
+                ) * variance < least and fewer.fit.loss * variance < AT_NOISE * noise
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer
             if weakest is None:
