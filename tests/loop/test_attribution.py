@@ -78,7 +78,7 @@ def test_a_hidden_effect_is_named_and_leaves_the_noise(effect: str) -> None:
 PAIRS = {52010: ("tendon_stretch", "axial_compression"), 52000: ("axial_compression", "marker_offset")}
 
 
-@pytest.mark.study(beyond=1)
+@pytest.mark.study
 @pytest.mark.parametrize("seed", PAIRS)
 def test_of_two_hidden_effects_neither_is_lost(seed: int) -> None:
     """A spring at the tip stood in for the first two; of the others the smaller passed for a correction of
