@@ -617,8 +617,8 @@ class Search:
         self, state: ModelState, found: Sequence[str], least: float, noise: float
     ) -> tuple[ModelState, list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where
-        what is left is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant
-        effect they only correct its form. The state, and who is left."""
+        what is left is of the size of the `noise` [both m^2 summed over the residual] and they do not explain
+        it: beside a dominant effect they only correct its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, ModelState] | None = None
@@ -630,9 +630,9 @@ class Search:
                 )
                 needless = not needed and not (verdict.z > Z_STRONG and verdict.bic_gain > BIC_STRONG)
                 variance = float((self.target.sigma**2).mean())
-                small = (
-                    fewer.fit.loss - state.fit.loss
-                ) * variance < least and fewer.fit.loss * variance < AT_NOISE * noise
+                before, after = (one.fit.loss * variance for one in (fewer, state))
+                explains = after < AT_NOISE * noise <= before  # the log is explained with it, and not without
+                small = before - after < least and before < 2.0 * noise and not explains
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer
             if weakest is None:
