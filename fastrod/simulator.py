@@ -199,7 +199,13 @@ class Simulator(RobotBatch):
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, *more, base_pose, gravity)
         how = How(self.dt, passes, estimate_error, inverse_inertia, derive)
         self._rods.accept(given, how)
-        return self._step(given, how, self._moved_obstacles(obstacle_pose, obstacle_velocity))
+        moved, before = self._moved_obstacles(obstacle_pose, obstacle_velocity), self._before
+        ports, rows = self._read(given)
+        self._move_obstacles(moved)
+        how = how._replace(
+            derive=derive and self._bare is None, relocate=self._relocated if given.point_force else None
+        )
+        return self._note(self._rods.step(rows, self._acting(ports), before, how), rows)
 
     @named_inputs
     @one_blas_thread

@@ -199,7 +199,8 @@ class Reader:
 
     def _array(self, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str) -> Floats:
         """(1 or n_robots, *shape), finite but for rows that are noted as problems."""
-        refuse_masked(name, value)
+        if type(value) is not np.ndarray:
+            refuse_masked(name, value)
         try:
             a = np.asarray(value)
             if a.dtype.kind in "cmM":

@@ -89,9 +89,8 @@ class ObserverSolver:
             passes.stretch(rows, ports.extension - before.extension)
         if len(cold := rows[~last.warm[rows]]):
             cold_start(cold, passes.layout, passes.params, ports, passes.memory)
-        jacobian = None
+        jacobian, (process, noise) = None, self.noise
         if how.derive and len(rows) == n and (linear := Linear(passes, rows, ports)).fits(turning=True):
-            process, noise = self.noise
             shape, jacobian = linear.step(how.relocate, True, self.outputs, process=process, noise=noise)
         else:
             shape = self.new_shape(self.outputs, len(rows) < n)
@@ -99,7 +98,10 @@ class ObserverSolver:
             if kept.any():
                 passes.run(rows[kept], ports, shape, predict=True, n_col=0)
             if not kept.all():
-                self._observe(rows[~kept], ports, shape, predict=True)
+                propagate = passes.propagate
+                passes.run(
+                    rows[~kept], ports, shape, predict=True, propagate=propagate, process=process, noise=noise
+                )
             passes.collect(shape)
         ok = passes.finite & (shape.residual < LOST * passes.params.rod_length)
         used: Ints = np.broadcast_to(np.int64(1 + self._learns), n)
@@ -135,17 +137,11 @@ class ObserverSolver:
         """Process and measurement noise of one step."""
         return (self.options.process_noise or _HIGH) * self.dt, self.options.measurement_noise / self.dt
 
-    def _observe(self, rows: Ints, ports: Ports, shape: RodShape, *, predict: bool) -> None:
-        """A pass of the observer, with its own gains."""
-        process, noise = self.noise
-        propagate = self.passes.propagate
-        self.passes.run(
-            rows, ports, shape, predict=predict, propagate=propagate, process=process, noise=noise
-        )
-
     def learn(self, rows: Ints, ports: Ports) -> None:
         """A pass on the inputs at which these robots are: it changes little but the gain."""
-        self._observe(rows, ports, self.new_shape("tip", True), predict=False)
+        process, noise = self.noise
+        shape, propagate = self.new_shape("tip", True), self.passes.propagate
+        self.passes.run(rows, ports, shape, propagate=propagate, process=process, noise=noise)
 
     def _keeps_jacobian(self, last: Last) -> Flags:
         """(n_robots,) these correct the boundary by the gain that they have."""

@@ -28,7 +28,7 @@ from fastrod.solver.merge import (
     replace_rows,
     restore_contact,
 )
-from fastrod.solver.protocol import Acting, How, Last, Solved, Solver
+from fastrod.solver.protocol import Acting, Last, Solved, Solver
 from fastrod.solver.recovery import sentence_of
 from fastrod.solver.state import MOVING, Snapshot, State, check_snapshot
 from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
@@ -98,16 +98,6 @@ class RobotBatch:
 
     def _acting(self, ports: Ports) -> Acting:
         return Acting(self._given, ports, self._params, self._reader.gravity, self._reader.loads)
-
-    def _step(self, given: Inputs, how: How, moved: tuple[Any, Any] | None) -> State:
-        """One step on these inputs, `moved` obstacles included."""
-        before = self._before
-        ports, rows = self._read(given)
-        self._move_obstacles(moved)
-        how = how._replace(
-            derive=how.derive and self._bare is None, relocate=self._relocated if given.point_force else None
-        )
-        return self._note(self._rods.step(rows, self._acting(ports), before, how), rows)
 
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         return self._note(self._rods.settle(rows, self._acting(ports), self._before, tolerance), rows, only)

@@ -12,6 +12,8 @@ from ..jit import LANES, inline, kernel
 from ..vec import Mat, Vec
 
 W = LANES
+BLOCK = 4
+"""Entries of a vector over unknowns that one loop over lanes takes together."""
 Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's
 
 

@@ -9,8 +9,7 @@ from fastrod.types import Layout, Memory, Params, Ports, Response, RodShape
 from ..jit import LANES, inline
 from . import columns as col
 from . import shape as sh
-from .lanes import LaneMatrix, Lanes, clear, take
-from .observer import BLOCK
+from .lanes import BLOCK, LaneMatrix, Lanes, clear, take
 
 
 class Batch(NamedTuple):
@@ -80,7 +79,7 @@ class Size(NamedTuple):
     col: int
     """Columns."""
     p: int
-    """Unknowns, rounded up to whole blocks of `observer`."""
+    """Unknowns, rounded up to whole blocks."""
 
 
 class RodLanes(NamedTuple):
@@ -128,7 +127,7 @@ class PassWorkspace(NamedTuple):
     units: Lanes
     """(n_x,) natural size of each unknown."""
     vector: Lanes
-    """(n_p + 2,) for `observer.gain`."""
+    """(n_p + 2,) for `boundary.gain`."""
 
 
 @inline
