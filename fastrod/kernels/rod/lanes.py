@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from fastrod.types import Floats
+
 from ..jit import LANES, inline, kernel
 from ..vec import Mat, Vec
 
@@ -15,6 +19,11 @@ W = LANES
 BLOCK = 4
 """Entries of a vector over unknowns that one loop over lanes takes together."""
 Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's
+
+
+index = np.uint64
+"""A place that is never negative: numba asks of a signed one whether it counts from the end, and a loop over
+lanes with that question in it does not become SIMD code."""
 
 
 class LaneMatrix(NamedTuple):
@@ -27,25 +36,25 @@ class LaneMatrix(NamedTuple):
 @inline
 def read(a: Lanes, field: int, w: int) -> float:
     """The number of lane w in a field."""
-    return a[field * W + w]  # type: ignore[no-any-return]
+    return a[index(field * W + w)]  # type: ignore[no-any-return]
 
 
 @inline
 def write(a: Lanes, field: int, w: int, value: float) -> None:
     """a[field] = value in lane w."""
-    a[field * W + w] = value
+    a[index(field * W + w)] = value
 
 
 @inline
 def at(m: LaneMatrix, r: int, c: int, w: int) -> float:
     """Entry (r, c) of lane w."""
-    return m.entries[(r * m.n_columns + c) * W + w]  # type: ignore[no-any-return]
+    return m.entries[index((r * m.n_columns + c) * W + w)]  # type: ignore[no-any-return]
 
 
 @inline
 def write_at(m: LaneMatrix, r: int, c: int, w: int, value: float) -> None:
     """m[r, c] = value in lane w."""
-    m.entries[(r * m.n_columns + c) * W + w] = value
+    m.entries[index((r * m.n_columns + c) * W + w)] = value
 
 
 @inline
@@ -57,15 +66,15 @@ def take(a: Lanes, first: int, n: int) -> tuple[Lanes, int]:
 @inline
 def get(a: Lanes, field: int, w: int) -> Vec:
     """The vector of lane w that begins at a field."""
-    return a[field * W + w], a[(field + 1) * W + w], a[(field + 2) * W + w]
+    return a[index(field * W + w)], a[index((field + 1) * W + w)], a[index((field + 2) * W + w)]
 
 
 @inline
 def put(a: Lanes, field: int, w: int, v: Vec) -> None:
     """a[field : field + 3] = v in lane w."""
-    a[field * W + w] = v[0]
-    a[(field + 1) * W + w] = v[1]
-    a[(field + 2) * W + w] = v[2]
+    a[index(field * W + w)] = v[0]
+    a[index((field + 1) * W + w)] = v[1]
+    a[index((field + 2) * W + w)] = v[2]
 
 
 @inline
@@ -88,3 +97,25 @@ def clear(a: Lanes) -> None:
     """Zero everywhere."""
     for i in range(len(a)):
         a[i] = 0.0
+
+
+@kernel
+def add_two(to: Lanes, field: int, a: float, x: Lanes, b: float, y: Lanes) -> None:
+    """to[field] += a x + b y, of one field."""
+    out = to[field * W : (field + 1) * W]
+    for w in range(len(out)):  # were their number known here, LLVM would unroll them, and lose the SIMD code
+        out[w] += a * x[w] + b * y[w]
+
+
+@kernel
+def weighted_sum(to: Lanes, weights: Floats, rows: Lanes, field: int, n: int) -> None:
+    """The first n fields of `to` become sum_k weights[k] rows[k], of the n fields there from `field` on.
+
+    One long loop: of three fields at once LLVM would unroll sixteen lanes, and lose the SIMD code.
+    """
+    for i in range(n * W):
+        to[i] = 0.0
+    for k in range(len(weights)):
+        weight, row = weights[k], rows[k, field * W : (field + n) * W]
+        for i in range(n * W):
+            to[i] += weight * row[i]

@@ -12,7 +12,7 @@ from fastrod.types import Ints
 
 from ...jit import kernel
 from ...vec import add, axpy, cross, dot, mul, scale, sub
-from ..lanes import Lanes, W, at, clear, get, get_mat, put, read, write, write_at
+from ..lanes import Lanes, W, add_two, at, clear, get, get_mat, put, read, weighted_sum, write, write_at
 from .balance import balance_of_piece, pass_on, start_at_tip
 from .fields import (
     B_BACK,
@@ -50,11 +50,7 @@ def forces_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork, mome
     """Change of the forces on the tangents by a column (N + 1, COLUMN), into `work.force`, and of the moment
     beyond the piece, into `moment` (3,)."""
     n, beyond, piece, total = b.width.shape[0], work.beyond[0], work.piece[p], work.scratch
-    for w in range(W):
-        put(total, 0, w, (0.0, 0.0, 0.0))
-    for j in range(n + 1):
-        for w in range(W):
-            put(total, 0, w, axpy(b.integral[n, j], get(column[j], C_V, w), get(total, 0, w)))
+    weighted_sum(total, b.integral[n], column, C_V, 3)
     for w in range(W):
         displacement = scale(read(piece, P_L, w), get(total, 0, w))
         th, first = get(column[n], C_TH, w), get(beyond, B_FIRST, w)
@@ -63,12 +59,7 @@ def forces_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork, mome
         put(moment, 0, w, add(cross(first, displacement), mul(get_mat(beyond, B_BACK, w), th)))
     for j in range(n + 1):
         to, weight = work.force[j], b.integral[n, j]
-        for w in range(W):
-            put(to, 0, w, (0.0, 0.0, 0.0))
-        for k in range(n + 1):
-            s, v = b.inertia[j, k], column[k]
-            for w in range(W):
-                put(to, 0, w, axpy(s, get(v, C_V, w), get(to, 0, w)))
+        weighted_sum(to, b.inertia[j], column, C_V, 3)
         for w in range(W):
             l = read(piece, P_L, w)  # noqa: E741
             inertia = scale(work.scheme[w] * read(piece, P_RHO, w) * l * l * l, get(to, 0, w))
@@ -147,8 +138,7 @@ def work_of_column(p: int, a: int, column: Lanes, b: ModalBasis, work: ModalWork
     if c < 3:
         for i in range(b.width.shape[0]):
             here, b1, b2 = work.interval[p, i], b.at_gauss[i, 0, m], b.at_gauss[i, 1, m]
-            for w in range(W):
-                out[w] += b1 * read(here, I_WORK + c, w) + b2 * read(here, I_WORK + 3 + c, w)
+            add_two(out, 0, b1, here[(I_WORK + c) * W :], b2, here[(I_WORK + 3 + c) * W :])
         return
     for j in range(b.node.shape[0]):
         node, value, force = work.node[p, j], b.at_node[j, m], work.force[j]
@@ -304,9 +294,10 @@ def assemble(b: ModalBasis, first_tendon: Ints, work: ModalWork) -> None:
         rotary_of_piece(p, b, work)
         tendon_stiffness_of_piece(p, first_tendon[p], b, work)
         own_block(p, b, work, moment, out)
-        rotations_of_piece(p, b, work, moment, out)
-        displacements_of_piece(p, b, work)
-        coupling_of_piece(p, b, work)
+        if p > 0 or hosted(work):  # else nothing that moves is nearer to the base
+            rotations_of_piece(p, b, work, moment, out)
+            displacements_of_piece(p, b, work)
+            coupling_of_piece(p, b, work)
         if hosted(work):
             couple_piece(p, b, work)
         pass_on(p, b, work)

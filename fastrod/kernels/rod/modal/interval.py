@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from ...jit import inline, kernel
 from ...vec import Sym, Vec, axpy, cross, dot, mul_t, scale, sym_mul
-from ..lanes import Lanes, W, at, get, get_mat, read, write, write_at
+from ..lanes import Lanes, W, add_two, at, get, get_mat, read, write, write_at
 from .fields import I_DK, I_LOCAL, I_M, I_O, I_U, I_WORK, N_R, P_K, P_L, P_TAU, P_UNEVEN, ModalWork, hessian
 from .modes import ModalBasis
 from .sweep import MAGNUS, exp_series, rotation_vector_changes
@@ -99,10 +99,8 @@ def add_local(p: int, a: int, b: ModalBasis, work: ModalWork) -> None:
     for i in range(b.width.shape[0]):
         here, b1, b2 = work.interval[p, i], b.at_gauss[i, 0, m], b.at_gauss[i, 1, m]
         for f in range(6):
-            first, second, to = I_LOCAL + entry(f, c), I_LOCAL + entry(f, 3 + c), I_WORK + f
-            for w in range(W):
-                own = b1 * read(here, first, w) + b2 * read(here, second, w)
-                write(here, to, w, read(here, to, w) + own)
+            first, second = here[(I_LOCAL + entry(f, c)) * W :], here[(I_LOCAL + entry(f, 3 + c)) * W :]
+            add_two(here, I_WORK + f, b1, first, b2, second)
 
 
 @kernel

@@ -11,7 +11,7 @@ import math
 
 from ...jit import inline, kernel
 from ...vec import Mat, Vec, add, axpy, cross, dot, matmul, mul, scale
-from ..lanes import W, get, get_mat, put, put_mat, read, write
+from ..lanes import W, get, get_mat, put, put_mat, read, weighted_sum, write
 from .fields import C_TH, C_V, I_O, I_STAR, I_U, I_V, I_W, N_POS, N_R, N_T, P_L, ModalWork
 from .modes import ModalBasis
 
@@ -139,16 +139,9 @@ def positions_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
     n = b.width.shape[0]
     for k in range(1, n + 1):
         to = node[k]
-        for c in range(3):
-            for w in range(W):
-                write(to, N_POS + c, w, 0.0)
-            for j in range(n + 1):
-                s, t = b.integral[k, j], node[j]
-                for w in range(W):
-                    write(to, N_POS + c, w, read(to, N_POS + c, w) + s * read(t, N_T + c, w))
-            for w in range(W):
-                grown = read(length, P_L, w) * read(to, N_POS + c, w)
-                write(to, N_POS + c, w, read(start, N_POS + c, w) + grown)
+        weighted_sum(to[N_POS * W :], b.integral[k], node, N_T, 3)
+        for w in range(W):
+            put(to, N_POS, w, axpy(read(length, P_L, w), get(to, N_POS, w), get(start, N_POS, w)))
 
 
 @kernel
@@ -186,16 +179,10 @@ def end_motion(p: int, a: int, b: ModalBasis, work: ModalWork) -> None:
     """Motion of the piece's end by a mode."""
     column, end, length = work.column[p, a], work.end[p, a], work.piece[p]
     n = b.width.shape[0]
-    for c in range(3):
-        for w in range(W):
-            write(end, c, w, 0.0)
-            write(end, 3 + c, w, read(column[n], C_TH + c, w))
-        for j in range(n + 1):
-            s, at = b.integral[n, j], column[j]
-            for w in range(W):
-                write(end, c, w, read(end, c, w) + s * read(at, C_V + c, w))
-        for w in range(W):
-            write(end, c, w, read(length, P_L, w) * read(end, c, w))
+    weighted_sum(end, b.integral[n], column, C_V, 3)
+    for w in range(W):
+        put(end, 0, w, scale(read(length, P_L, w), get(end, 0, w)))
+        put(end, 3, w, get(column[n], C_TH, w))
 
 
 @kernel
