@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -82,6 +83,16 @@ def test_threads_of_the_kernels_sleep_while_they_wait() -> None:
     )
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in done.stderr
     assert done.stdout == "None\n"  # a user's other programs are left alone
+
+
+@pytest.mark.study
+def test_no_kernel_writes_what_two_of_its_arrays_reach() -> None:
+    """As LLVM is told; of the watched calls one does so on purpose."""
+    script = [sys.executable, str(Path(__file__).with_name("overlap.py"))]
+    done = subprocess.run(script, check=True, capture_output=True, text=True)
+    ran, found = done.stdout.split(" ", 1)
+    assert int(ran) > 190
+    assert found == "['__main__.shift(to: Any, by: Any) -> None']\n"
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="this machine has one core")

@@ -88,41 +88,6 @@ def test_line_weight_is_the_simulators() -> None:
         )
 
 
-@pytest.mark.parametrize("bend", [0.05, 0.7, -1.3, 2.5])
-def test_without_load_it_is_an_arc(bend: float) -> None:
-    rest = PlantRod(compliance=STIFF).rest(tendons(0.0, bend), STILL, DOWN)
-    assert_allclose(
-        rest.position,
-        LENGTH / bend * np.array([1.0 - math.cos(bend), 0.0, math.sin(bend)]),
-        rtol=0,
-        atol=2e-7,
-    )
-    # EI u = sum of tension times distance, shared by the two tendons of the pair; 1e-9 m/N makes newtons of
-    # the last picometres
-    assert_allclose(
-        rest.tension, EI * bend / (2.0 * OFFSET * LENGTH) * np.array([1.0, 0.0, -1.0, 0.0]), rtol=0, atol=0.05
-    )
-
-
-def test_small_loads_bend_a_beam_whose_tip_the_wires_keep_from_turning() -> None:
-    aside = np.array([0.0, 1.0, 0.0])
-    tip = PlantRod(compliance=STIFF).rest(np.zeros(4), 1e-3 * aside, aside)
-    assert tip.position[1] == pytest.approx(1e-3 * LENGTH**3 / (12.0 * EI), rel=1e-3)  # F l^3 / 12 EI
-    line = PlantRod(compliance=STIFF, weight=1e-2).rest(np.zeros(4), STILL, aside)
-    assert line.position[1] == pytest.approx(1e-2 * LENGTH**4 / (24.0 * EI), rel=1e-3)  # w l^4 / 24 EI
-    assert_allclose([tip.rotation[1, 2], line.rotation[1, 2]], 0.0, atol=1e-6)
-
-
-def test_a_quarter_turn_of_wires_and_loads_turns_the_shape() -> None:
-    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    dl, force, down = tendons(0.4, -0.7), np.array([0.3, 0.5, -0.4]), np.array([0.6, 0.0, -0.8])
-    it = PlantRod(weight=4.0, slope=0.1, compliance=3e-4, settling=0.3)
-    one, other = it.rest(dl, force, down), it.rest(np.roll(dl, 1), quarter @ force, quarter @ down)
-    assert_allclose(other.position, quarter @ one.position, rtol=0, atol=1e-10)
-    assert_allclose(other.rotation, quarter @ one.rotation @ quarter.T, rtol=0, atol=1e-8)
-    assert_allclose(other.tension, np.roll(one.tension, 1), rtol=0, atol=1e-6)
-
-
 def test_tensions_change_with_the_wires_by_their_slope() -> None:
     it, dl, force, h = (
         PlantRod(compliance=3e-4, settling=0.3, weight=3.0),
