@@ -108,6 +108,14 @@ def add_two(to: Lanes, field: int, a: float, x: Lanes, b: float, y: Lanes) -> No
 
 
 @kernel
+def add_product(to: Lanes, field: int, x: Lanes, y: Lanes) -> None:
+    """to[field] += x y, of one field."""
+    out = to[field * W : (field + 1) * W]
+    for w in range(len(out)):
+        out[w] += x[w] * y[w]
+
+
+@kernel
 def weighted_sum(to: Lanes, weights: Floats, rows: Lanes, field: int, n: int) -> None:
     """The first n fields of `to` become sum_k weights[k] rows[k], of the n fields there from `field` on.
 

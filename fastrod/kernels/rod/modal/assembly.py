@@ -37,12 +37,11 @@ from .fields import (
     S_ROW,
     ModalWork,
     hessian,
-    path_change,
 )
 from .host import couple_piece, hosted
 from .interval import add_elasticity, add_local, local_of_piece
 from .modes import ModalBasis
-from .tendons import tendon_stiffness_of_piece
+from .tendons import add_tendons, tendon_stiffness_of_piece
 
 
 @kernel
@@ -261,23 +260,6 @@ def coupling_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
                     moved = add(get(end, 0, w), cross(th, arm))
                     both = dot(get(gamma, 0, w), moved) + dot(get(gamma, 3, w), th)
                     write_at(hessian(work), row, col, w, both)
-
-
-@kernel
-def add_tendons(first_tendon: Ints, work: ModalWork, pull: Lanes) -> None:
-    """Add (1 / c) dl dl^T of every tendon that is taut; those before `first_tendon` of a piece end before
-    it."""
-    n_q = len(work.q) // W
-    n_modes = n_q // work.piece.shape[0]
-    for a in range(n_q):
-        row = hessian(work).entries[a * n_q * W : (a * n_q + a + 1) * W]
-        for t in range(first_tendon[a // n_modes], len(work.tension) // W):
-            change = path_change(work).entries[t * n_q * W : (t * n_q + a + 1) * W]
-            for w in range(W):
-                pull[w] = work.stiffness[t * W + w] * read(change, a, w)
-            for c in range(a + 1):
-                for w in range(W):
-                    write(row, c, w, read(row, c, w) + pull[w] * read(change, c, w))
 
 
 @kernel

@@ -18,13 +18,14 @@ def subtract_products(to: Lanes, x: Lanes, y: Lanes, n: int) -> None:
     """to -= sum of x_k y_k, four at a time: `to` is read and written a quarter as often."""
     for k in range(0, n - 3, 4):
         u, v = x[k * W : (k + 4) * W], y[k * W : (k + 4) * W]
-        for w in range(W):
+        for w in range(len(to)):  # W of them (`lanes.add_two`)
             four = u[w] * v[w] + u[W + w] * v[W + w]
             four += u[2 * W + w] * v[2 * W + w] + u[3 * W + w] * v[3 * W + w]
             to[w] -= four
     for k in range(n - n % 4, n):
-        for w in range(W):
-            to[w] -= x[k * W + w] * y[k * W + w]
+        u, v = x[k * W :], y[k * W :]
+        for w in range(len(to)):
+            to[w] -= u[w] * v[w]
 
 
 @kernel
@@ -48,7 +49,7 @@ def factor(m: LaneMatrix, replaced: Lanes) -> None:
         for i in range(j + 1, n):
             to = a[i * row + j * W : i * row + (j + 1) * W]
             subtract_products(to, a[i * row :], a[j * row :], j)
-            for w in range(W):
+            for w in range(len(to)):
                 to[w] *= pivot[w]
 
 
@@ -68,7 +69,7 @@ def forward(m: LaneMatrix, x: Lanes) -> None:
         to = x[i * W : (i + 1) * W]
         for k in range(i):
             left, right = a[i * row + k * W :], x[k * W :]
-            for w in range(W):
+            for w in range(len(to)):
                 to[w] -= left[w] * right[w]
         for w in range(W):
             to[w] *= a[i * row + i * W + w]
@@ -84,7 +85,7 @@ def backward(m: LaneMatrix, x: Lanes) -> None:
         to = x[i * W : (i + 1) * W]
         for k in range(i + 1, n):
             left, right = a[k * row + i * W :], x[k * W :]
-            for w in range(W):
+            for w in range(len(to)):
                 to[w] -= left[w] * right[w]
         for w in range(W):
             to[w] *= a[i * row + i * W + w]

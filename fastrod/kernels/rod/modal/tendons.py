@@ -13,7 +13,7 @@ from fastrod.types import Floats, Ints
 
 from ...jit import inline, kernel
 from ...vec import Vec, dot, scale
-from ..lanes import Lanes, W, at, clear, get, put, read, write, write_at
+from ..lanes import Lanes, W, add_product, add_two, at, clear, get, put, read, write, write_at
 from .fields import I_LOCAL, I_U, I_V, P_L, ModalWork, hessian, path_change
 from .modes import ModalBasis
 
@@ -47,6 +47,8 @@ def entry(r: int, c: int) -> int:
 def add_paths(p: int, t: int, b: ModalBasis, work: ModalWork, with_columns: bool) -> None:
     """Add to the length of tendon t, and to its derivatives, what lies in piece p."""
     n_modes, change, offset = b.component.shape[0], work.scratch, work.offset[p, 2 * t * W :]
+    n_q = len(work.q) // W
+    row = work.path_change[t * n_q * W : (t + 1) * n_q * W]
     for i in range(b.width.shape[0]):
         here, width = work.interval[p, i], 0.5 * b.width[i]
         for g in range(2):
@@ -59,13 +61,12 @@ def add_paths(p: int, t: int, b: ModalBasis, work: ModalWork, with_columns: bool
                 half, x, y = width * read(work.piece[p], P_L, w), read(offset, 0, w), read(offset, 1, w)
                 size, d, _ = path(get(here, I_U + 3 * g, w), get(here, I_V + 3 * g, w), x, y)
                 write(work.path_length, t, w, read(work.path_length, t, w) + half * size)
-                put(change, 0, w, scale(half, (y * d[2], -x * d[2], x * d[1] - y * d[0])))
-                put(change, 3, w, scale(half, d))
-            for a in range(n_modes if with_columns else 0):
-                value, c = b.at_gauss[i, g, b.degree[a]], b.component[a]
-                for w in range(W):
-                    grown = at(path_change(work), t, p * n_modes + a, w) + value * read(change, c, w)
-                    write_at(path_change(work), t, p * n_modes + a, w, grown)
+                put(change, 6 * g, w, scale(half, (y * d[2], -x * d[2], x * d[1] - y * d[0])))
+                put(change, 6 * g + 3, w, scale(half, d))
+        for a in range(n_modes if with_columns else 0):
+            m, c = b.degree[a], b.component[a]
+            first, second = change[c * W :], change[(6 + c) * W :]
+            add_two(row, p * n_modes + a, b.at_gauss[i, 0, m], first, b.at_gauss[i, 1, m], second)
 
 
 @kernel
@@ -154,6 +155,22 @@ def tendon_stiffness_of_piece(p: int, first: int, b: ModalBasis, work: ModalWork
                     for w in range(W):
                         grown = at(hessian(work), row, col, w) + k * read(sums, place, w)
                         write_at(hessian(work), row, col, w, grown)
+
+
+@kernel
+def add_tendons(first_tendon: Ints, work: ModalWork, pull: Lanes) -> None:
+    """Add (1 / c) dl dl^T of every tendon that is taut; those before `first_tendon` of a piece end before
+    it."""
+    n_q = len(work.q) // W
+    n_modes = n_q // work.piece.shape[0]
+    for a in range(n_q):
+        row = hessian(work).entries[a * n_q * W : (a * n_q + a + 1) * W]
+        for t in range(first_tendon[a // n_modes], len(work.tension) // W):
+            change = path_change(work).entries[t * n_q * W : (t * n_q + a + 1) * W]
+            for w in range(W):
+                pull[w] = work.stiffness[t * W + w] * read(change, a, w)
+            for c in range(a + 1):
+                add_product(row, c, pull, change[c * W :])
 
 
 @kernel
