@@ -1,14 +1,11 @@
 """Kernels run as Python, and their arrays watched: prints in which of them a place is written that two
-arguments reach. `kernels.jit.kernel` tells LLVM that there is none."""
+arguments reach. `kernels.jit.kernel` tells LLVM that there is none. With NUMBA_DISABLE_JIT=1."""
 
 import inspect
-import os
 from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
-
-os.environ["NUMBA_DISABLE_JIT"] = "1"
 
 import numpy as np
 import trimesh
