@@ -1,5 +1,5 @@
 """Kernels run as Python, and their arrays watched: prints in which of them a place is written that two
-arguments reach. `kernels.jit.kernel` tells LLVM that there is none. With NUMBA_DISABLE_JIT=1."""
+arguments reach, which `noalias` (`kernels.jit.kernel`) rules out. To be run with NUMBA_DISABLE_JIT=1."""
 
 import inspect
 from collections import Counter, defaultdict

@@ -87,7 +87,7 @@ def test_threads_of_the_kernels_sleep_while_they_wait() -> None:
 
 @pytest.mark.study
 def test_no_kernel_writes_what_two_of_its_arrays_reach() -> None:
-    """As LLVM is told; of the watched calls one does so on purpose."""
+    """Or `noalias` would be wrong; of the watched calls one does so on purpose."""
     script = [sys.executable, str(Path(__file__).with_name("overlap.py"))]
     plain = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(script, env=plain, check=True, capture_output=True, text=True)

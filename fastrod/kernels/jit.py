@@ -140,13 +140,13 @@ def kernel(function: _Function) -> _Function:
     Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as
     much as the arithmetic. A kernel may therefore slice arrays but not make them.
 
-    What it writes by one of its arguments it must not reach by another: LLVM is told so. Where it has to ask
-    whether arrays overlap, a loop over sixteen lanes does not become SIMD code (a step of rods of modes took
-    twice as long).
+    Its array arguments are `noalias` for LLVM: what it writes by one of them it must not reach by another.
+    Where LLVM has to check for overlap, a loop over sixteen lanes does not become SIMD code (a step of rods
+    of modes took twice as long).
     """
     made = _inner(function, nogil=True)
     if _NUMBA_IS_KNOWN and isinstance(made, _Inner):
-        cast(Any, made)._compiler._customize_flags = _apart
+        cast(Any, made)._compiler._customize_flags = _noalias
     return made
 
 
@@ -230,8 +230,8 @@ def _inner(function: _Function, **options: bool) -> _Function:
     return cast(_Function, made)
 
 
-def _apart(flags: Any) -> Any:
-    """Numba's flags for a function whose arrays lie apart."""
+def _noalias(flags: Any) -> Any:
+    """Numba's flags for a function whose array arguments do not overlap."""
     flags.noalias = True
     return flags
 

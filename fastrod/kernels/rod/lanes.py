@@ -117,7 +117,8 @@ def add_product(to: Lanes, field: int, x: Lanes, y: Lanes) -> None:
 
 @kernel
 def weighted_sum(to: Lanes, weights: Floats, rows: Lanes, field: int, n: int) -> None:
-    """The first n fields of `to` become sum_k weights[k] rows[k], of the n fields there from `field` on.
+    """The first n fields of `to` become sum_k weights[k] rows[k] of `weights` (n_rows,) and `rows` (n_rows,
+    n_fields * W), of whose fields it takes n from `field` on.
 
     One long loop: of three fields at once LLVM would unroll sixteen lanes, and lose the SIMD code.
     """
