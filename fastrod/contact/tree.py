@@ -15,7 +15,7 @@ from fastrod.contact.primitive import primitive_of
 from fastrod.kernels.contact.bvh import LEAF_CODE
 from fastrod.types import Floats, Ints, Surfaces
 
-_LEAF = 4  # triangles at most
+_LEAF = LEAF_CODE - 1  # triangles at most
 _EVEN = 1e-8  # of a mesh's size: a neighbour that rises less above a face does not
 
 

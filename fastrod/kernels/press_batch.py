@@ -110,7 +110,7 @@ def press_some(
         np.empty((m, 3)),
         np.empty((n, n)),
         np.empty(n),
-        np.empty((5, n)),
+        np.empty((3, n)),
     )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
     every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)

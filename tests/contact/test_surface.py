@@ -73,7 +73,7 @@ def _curvatures(k, frame, points, surfaces, out):
     stack = np.empty(2 * STACK)
     for i in range(len(points)):
         first, second, along = surface_curvature(
-            k, frame, (points[i, 0], points[i, 1], points[i, 2]), surfaces, stack
+            k, frame, (points[i, 0], points[i, 1], points[i, 2]), FAR, surfaces, stack
         )
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = first, second, along[0], along[1], along[2]
 
@@ -439,7 +439,7 @@ def test_every_triangle_is_in_one_leaf_and_every_box_holds_what_is_below(name):
                 stack.append((int(s.link[link, side]), inside, level + 1))
             continue
         first, count = divmod(-1 - link, LEAF_CODE)
-        assert 1 <= count <= 4
+        assert 1 <= count < LEAF_CODE
         leaf[first : first + count] += 1
         corners = s.corner[first : first + count].reshape(-1, 3)
         assert (corners >= around[:3]).all()

@@ -101,6 +101,8 @@ def wall_at(
             if t < FAR and facing > 0.0:
                 return -t * facing, wall
         return d, n
+    if surfaces.convex[k]:
+        return d, n
     best, alike = -1, dot(n, old) + 1e-6
     count = walls(k, frame, p, d + margin, d, surfaces, stack, found)
     for j in range(count):

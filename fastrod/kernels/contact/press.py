@@ -21,7 +21,7 @@ from fastrod.types import ContactSet, Floats, Records
 from ..jit import inline, kernel
 from ..vec import Vec, dot, scale, sub
 from .bvh import normal_of
-from .pressed_world import PressedWorld, add_slides
+from .pressed_world import PressedWorld, add_scaled, add_slides
 
 _FEW, _ROUNDS, _HALVINGS = 6, 40, 40
 _SOFTEST, _HARDENS = 1e6, 0.1  # of R, in so many times less each
@@ -121,62 +121,68 @@ def _is_linear(m: int, n: int, pressing: PressedWorld, before: Floats, after: Fl
 
 
 @kernel
-def _factor(n: int, l: Floats, diagonal: Floats, column: Floats) -> bool:  # noqa: E741
-    """Cholesky's factor in place, one over its diagonal in it, column by column: its rows are long enough for
-    SIMD. Whether all pivots were positive; the diagonal stands for one that is not."""
-    good = True
-    for a in range(n):
-        diagonal[a] = l[a, a]
+def _subtract_four(to: Floats, scaled: tuple[float, float, float, float], x: Floats) -> None:
+    """to -= scaled . four rows, which stand one after the other in x."""
+    n, width = len(to), len(x) // 4
+    one, two, three, four = x[:n], x[width : width + n], x[2 * width : 2 * width + n], x[3 * width :]
+    for c in range(n):
+        to[c] -= scaled[0] * one[c] + scaled[1] * two[c] + scaled[2] * three[c] + scaled[3] * four[c]
+
+
+@kernel
+def _factor(n: int, u: Floats) -> bool:
+    """U of M = U^T U in place of the upper triangle, row by row, so that loops run along rows, with one over
+    its diagonal. Whether all pivots were positive; the diagonal stands for one that is not."""
+    good, rows, width = True, u.reshape(-1), u.shape[1]
     for j in range(n):
-        pivot = l[j, j]
-        if not pivot > _PIVOT * abs(diagonal[j]):
-            pivot, good = abs(diagonal[j]) + 1e-300, False
+        to, whole, many = rows[j * width + j : j * width + n], abs(u[j, j]), j - j % 4
+        for k in range(0, many, 4):
+            scaled = u[k, j], u[k + 1, j], u[k + 2, j], u[k + 3, j]
+            _subtract_four(to, scaled, rows[k * width + j : k * width + j + 4 * width])
+        for k in range(many, j):
+            add_scaled(-u[k, j], rows[k * width + j : k * width + n], to)
+        pivot = to[0]
+        if not pivot > _PIVOT * whole:
+            pivot, good = whole + 1e-300, False
+        to[0] = 1.0
         inverse = 1.0 / math.sqrt(pivot)
-        l[j, j] = inverse
-        for a in range(j + 1, n):
-            column[a] = l[a, j] * inverse
-            l[a, j] = column[a]
-        for a in range(j + 1, n):
-            scaled = column[a]
-            for c in range(j + 1, a + 1):
-                l[a, c] -= scaled * column[c]
+        for c in range(len(to)):
+            to[c] *= inverse
     return good
 
 
 @kernel
 def _newton_step(m: int, n: int, pressing: PressedWorld, to: Floats) -> bool:
     """A Newton step from `pressing.step`, into `to`, and whether all pivots were positive."""
-    l, step = pressing.matrix, pressing.step  # noqa: E741
+    u, step = pressing.matrix, pressing.step
     for a in range(n):
         to[a] = -pressing.gradient[a]
     for c in range(n):
         for a in range(n):
-            l[c, a] = pressing.hessian[c, a]
-            to[a] -= l[c, a] * step[c]
+            u[c, a] = pressing.hessian[c, a]
+        add_scaled(-step[c], u[c, :n], to[:n])
     for k in range(m):
         along, law = pressing.along[k], pressing.law[k]
         y = _requested(law, _moved(n, along, pressing.free[k], step))
         force, _ = in_cone(law[0], y)
         for r in range(3):
-            for a in range(n if force[r] != 0.0 else 0):
-                to[a] += along[r, a] * force[r]
+            if force[r] != 0.0:
+                add_scaled(force[r], along[r, :n], to[:n])
             for s in range(3):
                 d = _slope(law[0], y, r, s) / law[1]
                 if d != 0.0:
                     for a in range(n):
-                        scaled = d * along[r, a]
-                        for c in range(a + 1 if scaled != 0.0 else 0):
-                            l[a, c] += scaled * along[s, c]
-    good = _factor(n, l, pressing.room[2], pressing.room[3])
+                        if along[r, a] != 0.0:
+                            add_scaled(d * along[r, a], along[s, a:n], u[a, a:n])
+    good = _factor(n, u)
     for k in range(n):
-        to[k] *= l[k, k]
+        to[k] *= u[k, k]
+        add_scaled(-to[k], u[k, k + 1 : n], to[k + 1 : n])
+    for k in range(n - 1, -1, -1):
+        left = to[k]
         for a in range(k + 1, n):
-            to[a] -= l[a, k] * to[k]
-    for b in range(n):
-        k = n - 1 - b
-        to[k] *= l[k, k]
-        for a in range(k):
-            to[a] -= l[k, a] * to[k]
+            left -= u[k, a] * to[a]
+        to[k] = left * u[k, k]
     return good
 
 
@@ -195,8 +201,8 @@ def _rotate_forces(m: int, n: int, contacts: ContactSet, pressing: PressedWorld,
         for a in range(n):
             for r in range(1, 3):
                 turned = sign * pressed * (c[r, 1] * along[1, a] + c[r, 2] * along[2, a])
-                for b in range(n if turned != 0.0 else 0):
-                    pressing.hessian[a, b] -= turned * along[r, b]
+                if turned != 0.0:
+                    add_scaled(-turned, along[r, :n], pressing.hessian[a, :n])
     return some
 
 
@@ -220,7 +226,7 @@ def _minimise(
     """Newton's method from the present step until one changes it by less than `small` of itself: whether it
     has ended, and whether the forces still turn with their surfaces."""
     step, to, trial, damping = pressing.step, pressing.room[0], pressing.room[1], _DAMPS
-    stiff = pressing.room[4]
+    stiff = pressing.room[2]
     for _ in range(rounds):
         while not _newton_step(m, n, pressing, to) and damping < _MOST_DAMPED:
             # not what the forces turn with their surfaces, or else more of the rods' diagonal: bodies begin
@@ -230,11 +236,9 @@ def _minimise(
             if turned:
                 _rotate_forces(m, n, contacts, pressing, -1.0)
             damping, turned = damping if turned else _STIFFENS * damping, False
-        for a in range(n):
-            stiff[a] = 0.0
+        stiff[:n] = 0.0
         for c in range(n):
-            for a in range(n):
-                stiff[a] += pressing.hessian[c, a] * to[c]
+            add_scaled(to[c], pressing.hessian[c, :n], stiff[:n])
         low, high, fraction = 0.0, 1.0, 1.0
         first = abs(_slope_along(m, n, pressing, step, to, stiff))
         for _ in range(_HALVINGS):
@@ -263,15 +267,13 @@ def press(
     the step uses has changed, by more than `renew` [m] times its friction. `still`: contacts stay where they
     are. Where Newton's method takes long (many contacts slip, in directions that they have yet to find),
     contacts are soft first."""
-    for a in range(n):
-        pressing.step[a] = 0.0
+    pressing.step[:n] = 0.0
     if not still:
         add_slides(m, n, contacts, pressing)
     turned = _rotate_forces(m, n, contacts, pressing, 1.0)
     ended, turned = _minimise(m, n, own, contacts, pressing, turned, _FEW, _SMALL)
     if not ended:
-        for a in range(n):
-            pressing.step[a] = 0.0
+        pressing.step[:n] = 0.0
         softer = _SOFTEST
         while softer > 1.0:
             _scale_softness(m, pressing, softer)

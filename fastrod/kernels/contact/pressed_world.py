@@ -12,7 +12,7 @@ from typing import NamedTuple
 from fastrod.types import ContactMotion, ContactRods, ContactSet, Floats, Ints, Records, Surfaces
 
 from ..jit import inline, kernel
-from ..rod.gather import pick
+from ..rod.gather import pick, scatter
 from ..vec import Vec, add, axpy, cross, dot, mul, mul_t, scale, sub
 from .bvh import Numbers, Record, normal_of
 from .centreline import bend_at, curve_of, curve_slip, interval_of, point_at, rotation_at, tangent_at
@@ -57,7 +57,7 @@ class PressedWorld(NamedTuple):
     step: Floats
     """(n,) out: change of the unknowns."""
     room: Floats
-    """(5, n) a step, a trial, a matrix's diagonal, a column of it, and the Hessian times the step."""
+    """(3, n) a step, a trial, and the Hessian times the step."""
 
 
 class Touching(NamedTuple):
@@ -79,6 +79,13 @@ class Touching(NamedTuple):
     """Number of the first contact among these points."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
+
+
+@kernel
+def add_scaled(k: float, x: Floats, to: Floats) -> None:
+    """to += k x."""
+    for a in range(len(to)):
+        to[a] += k * x[a]
 
 
 @inline
@@ -127,7 +134,7 @@ def _measure_obstacle(
     d = measure(contact, frame, p, motion.margin * all_of_it.rods.length[i], surfaces, stack, wall)
     n, first, second, e = normal_of(contact), 0.0, 0.0, (0.0, 0.0, 1.0)
     if d > 0.0:
-        first, second, e = surface_curvature(k, frame, p, surfaces, stack)
+        first, second, e = surface_curvature(k, frame, p, d, surfaces, stack)
     for a in range(3):
         for b in range(3):
             across = (1.0 if a == b else 0.0) - n[a] * n[b]
@@ -280,8 +287,8 @@ def add_slides(m: int, n: int, contacts: ContactSet, pressing: PressedWorld) -> 
         for a in range(n):
             one = pressed * (yields[0] * shift[0, a] + yields[1] * shift[1, a])
             other = pressed * (yields[1] * shift[0, a] + yields[2] * shift[1, a])
-            for b in range(n):
-                pressing.hessian[a, b] += one * shift[0, b] + other * shift[1, b]
+            add_scaled(one, shift[0, :n], pressing.hessian[a, :n])
+            add_scaled(other, shift[1, :n], pressing.hessian[a, :n])
 
 
 @kernel
@@ -403,11 +410,7 @@ def gather_world(
             held = (contact.held[0], contact.held[1], contact.held[2])
             for a in range(3):
                 axes[0, a], axes[1, a], axes[2, a] = n_axis[a], t1[a], t2[a]
-            pressing.free[m, 0], pressing.free[m, 1], pressing.free[m, 2] = (
-                contact.gap,
-                dot(slip, t1),
-                dot(slip, t2),
-            )
+            scatter(pressing.free[m], (contact.gap, dot(slip, t1), dot(slip, t2)))
             law[0], law[1] = mu if slides else 0.0, SOFT + soft
             law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
             if law[4] < 0.0:  # of a new contact: as far as its place has come

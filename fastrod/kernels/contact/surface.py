@@ -103,17 +103,17 @@ def ray_hit(
 
 @kernel
 def surface_curvature(
-    k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack: Numbers
+    k: int, frame: Numbers, p: Vec, d: float, surfaces: Surfaces, stack: Numbers
 ) -> tuple[float, float, Vec]:
-    """Principal curvatures of the distance from obstacle k at the world point p, outside: rotation of the
-    normal per length as p moves across the unit direction that is returned, and along it [1/m]. (The second
-    derivative of the distance.)"""
+    """Principal curvatures of the distance from obstacle k at the world point p, outside and no farther than
+    d from it: rotation of the normal per length as p moves across the unit direction that is returned, and
+    along it [1/m]. (The second derivative of the distance.)"""
     local = to_obstacle(frame, p)
     first, second, along = 0.0, 0.0, (0.0, 0.0, 1.0)
     if surfaces.primitive[k, 1] != 0:
         first, second, along = curvature_at(surfaces.primitive[k, 1], _size(k, surfaces), local)
     else:
-        square, _, t, feature = nearest_triangle(local, FAR, surfaces.root[k], surfaces, stack)
+        square, _, t, feature = nearest_triangle(local, d + 1e-8, surfaces.root[k], surfaces, stack)
         if feature > 0 and square > 0.0:
             first = 1.0 / math.sqrt(square)
             second = first
