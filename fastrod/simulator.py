@@ -20,7 +20,6 @@ from fastrod.solver.options import Modal, Observer, SchemeName, SolverName
 from fastrod.solver.protocol import How, Solver
 from fastrod.solver.robots import RobotBatch
 from fastrod.solver.state import Pose, State, check_on_robot
-from fastrod.threads import one_blas_thread
 from fastrod.types import Floats, Ports
 
 if TYPE_CHECKING:
@@ -136,7 +135,6 @@ class Simulator(RobotBatch):
         return f"Simulator({self.robots[0].name!r}{others}, {numbers}{contact}{device})"
 
     @named_inputs
-    @one_blas_thread
     def step(
         self,
         tendon_length: ArrayLike | None = None,
@@ -208,7 +206,6 @@ class Simulator(RobotBatch):
         return self._note(self._rods.step(rows, self._acting(ports), before, how), rows)
 
     @named_inputs
-    @one_blas_thread
     def settle(
         self,
         tendon_length: ArrayLike | None = None,
@@ -362,7 +359,7 @@ class Simulator(RobotBatch):
         )
         return found
 
-    @one_blas_thread
+    @named_inputs
     def jacobian(self, *, turning: bool = False) -> Floats:
         """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or
         N]), world frame.
@@ -408,7 +405,7 @@ class Simulator(RobotBatch):
         change: Floats = jacobian + by_force @ inverse @ (slopes @ jacobian[:, :3] + moved)
         return change
 
-    @one_blas_thread
+    @named_inputs
     def compliance(self, *, moments: bool = False) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation
         and contact forces held. With `moments` (n_robots, 6, 6): three columns more, by the tip's moment
@@ -511,7 +508,7 @@ class Simulator(RobotBatch):
             )
         return self._engine
 
-    @one_blas_thread
+    @named_inputs
     def markers(self) -> tuple[Floats, Floats]:
         """The first robot's `log_points` of the last state, with their offsets from the backbone: world
         (n_robots, k, 3) [m], and world_from_material (n_robots, k, 3, 3) of their cross-sections. On a robot

@@ -66,13 +66,10 @@ class _Held:
 
 
 def one_blas_thread(function: Callable[_Given, _Answer]) -> Callable[_Given, _Answer]:
-    """Call `function` with one thread of BLAS in this process, restored after; but not a method of something
-    with so few robots that they start none."""
+    """Call `function` with one thread of BLAS in this process, restored after."""
 
     @wraps(function)
     def held(*args: _Given.args, **kwargs: _Given.kwargs) -> _Answer:
-        if args and getattr(args[0], "n_robots", FEW + 1) <= FEW:
-            return function(*args, **kwargs)
         _Held.enter()
         try:
             return function(*args, **kwargs)

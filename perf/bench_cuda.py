@@ -140,7 +140,7 @@ def time_section(rows: list[Row]) -> Section:
 def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     """Return what a pass of one robot must move and compute, from the arrays that it is given."""
     from fastrod.kernels.jit import LANES
-    from fastrod.kernels.rod.workspace import scratch_size
+    from fastrod.kernels.rod.gather import scratch_size
 
     n = 64
     small = case_of(key, n)

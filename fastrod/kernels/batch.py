@@ -9,9 +9,8 @@ from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Response,
 
 from .jit import LANES, OnThreads, call_at, entry, kernel, parallel_entry, take_next
 from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
-from .rod.gather import predict
+from .rod.gather import Run, predict
 from .rod.lanes import Lanes
-from .rod.workspace import Run
 
 # The grid of a segment bends so that point loads act on nodes, where they cost no truncation error.
 _END = 1e-9  # of a segment: a load nearer to its end than this is on it

@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.kernels.batch import move_to_inputs, pass_robots
 from fastrod.kernels.jit import LANES
-from fastrod.kernels.rod.workspace import Mode, Run, scratch_size
+from fastrod.kernels.rod.gather import Mode, Run, scratch_size
 from fastrod.solver.gpu.device import Device
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, Response, RodShape
 
@@ -122,6 +122,13 @@ class BoundarySolver:
     def x(self) -> Floats:
         """(n_robots, n_x) of the memory, to read and to write."""
         return self._memory.x if self._resident is None else self._resident.write(("x",)).x
+
+    @property
+    def kept(self) -> tuple[Floats, Floats] | None:
+        """Return copies of x and of the guess of the curvature, 21 numbers of a five-segment robot, for when
+        it diverges. None on a GPU, from where they would have to come at every step: its robots begin from
+        the cold guess."""
+        return None if self.device == "cuda" else (self.x.copy(), self.memory.curvature_guess.copy())
 
     def peek(self) -> Memory:
         """The memory, to read only."""

@@ -15,6 +15,7 @@ from fastrod.checks import checked_array
 from fastrod.errors import InputError, Problem, ProblemSentence, nearest, refuse_masked, shown
 from fastrod.kernels.batch import place_all
 from fastrod.model.compile import DefaultInputs
+from fastrod.threads import FEW, one_blas_thread
 from fastrod.types import Flags, Floats, Layout, Params, Ports
 
 _P = ParamSpec("_P")
@@ -35,8 +36,9 @@ _MOST = 1e12  # of any unit; products of a few such numbers still are floats
 
 
 def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The same method; a keyword that it lacks raises `InputError` with the nearest name."""
-    parameters = inspect.signature(function).parameters
+    """The same method, with one thread of BLAS where there are so many robots that it would start more; a
+    keyword that it lacks raises `InputError` with the nearest name."""
+    parameters, of_many = inspect.signature(function).parameters, one_blas_thread(function)
     known = {name for name in parameters if name != "self"}
     positional = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters.values()) - 1
 
@@ -52,7 +54,7 @@ def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
                 f"{called} takes {positional} of its inputs without a name and was given {len(args) - 1}; "
                 "name the others, as in tip_force=..."
             )
-        return function(*args, **inputs)
+        return (of_many if getattr(args[0], "n_robots", 0) > FEW else function)(*args, **inputs)
 
     return checked
 

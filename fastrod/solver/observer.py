@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -14,7 +15,7 @@ from fastrod.solver.gpu.device import Device
 from fastrod.solver.inputs import Inputs
 from fastrod.solver.options import Observer
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
-from fastrod.solver.recovery import Boundary, unstable
+from fastrod.solver.recovery import HOPELESS, Boundary, unstable
 from fastrod.solver.response import Linear
 from fastrod.solver.settle import LOST, cold_start, frozen_pass, settle
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, RodShape
@@ -82,7 +83,7 @@ class ObserverSolver:
         """One pass of these robots; those that diverge are settled."""
         passes, ports, before, n = self.passes, acting.ports, last.ports, len(self._all)
         passes.params = acting.params
-        boundary = Boundary(passes) if self.recover else None
+        kept = passes.kept if self.recover else None
         if before is not None:
             if self._learns and _alike(before, ports):
                 self.learn(rows[last.warm[rows]], before)
@@ -94,13 +95,19 @@ class ObserverSolver:
             shape, jacobian = linear.step(how.relocate, True, self.outputs, process=process, noise=noise)
         else:
             shape = self.new_shape(self.outputs, len(rows) < n)
-            kept = self._keeps_jacobian(last)[rows]
-            if kept.any():
-                passes.run(rows[kept], ports, shape, predict=True, n_col=0)
-            if not kept.all():
+            cheap = self._keeps_jacobian(last)[rows]
+            if cheap.any():
+                passes.run(rows[cheap], ports, shape, predict=True, n_col=0)
+            if not cheap.all():
                 propagate = passes.propagate
                 passes.run(
-                    rows[~kept], ports, shape, predict=True, propagate=propagate, process=process, noise=noise
+                    rows[~cheap],
+                    ports,
+                    shape,
+                    predict=True,
+                    propagate=propagate,
+                    process=process,
+                    noise=noise,
                 )
             passes.collect(shape)
         ok = passes.finite & (shape.residual < LOST * passes.params.rod_length)
@@ -108,9 +115,9 @@ class ObserverSolver:
         if len(rows) < n:
             read = np.isin(self._all, rows)
             ok, used = ok & read, np.where(read, used, 0)
-        if boundary is not None and not ok[rows].all():
+        if self.recover and not ok[rows].all():
             lost, jacobian = rows[~ok[rows]], None
-            more = boundary.recover(lost, last.warm, ports, frozen_pass(passes, shape))
+            more = Boundary(passes, kept).recover(lost, last.warm, ports, frozen_pass(passes, shape))
             passes.collect(shape)
             ok |= (more > 0) & (shape.residual < LOST * passes.params.rod_length)
             used = np.where(more < 0, -1, used + more)
@@ -165,6 +172,8 @@ class ObserverSolver:
 
     def unstable(self, acting: Acting, shape: RodShape, rows: Ints) -> Ints:
         """Those of `rows` whose shape balances its loads, but would not stay."""
+        if not len(rows) or _largest_load(acting.params, acting.ports) <= HOPELESS:
+            return rows[:0]
         return unstable(acting.params, acting.ports, shape, rows)
 
     def replace(self, robots: Sequence[Robot]) -> None:
@@ -209,6 +218,24 @@ def _moves(before: Floats | None, force: Floats, warm: Flags) -> bool:
     same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
     every = slice(None) if max(len(force), len(before)) == 1 else warm
     return not same and bool((force != before)[every].any())
+
+
+def _largest_load(params: Params, ports: Ports) -> float:
+    """A cheap upper bound of the load parameter of all robots: a step asks for it every time. nan, where one
+    of many robots has an input that cannot be used."""
+    length, segments = _largest(params.rod_length), params.length.shape[1]
+    shortest = length if len(params.rod_length) == 1 else float(params.rod_length.min())
+    force = _largest(ports.tip_force) + _largest(ports.tip_moment) / shortest + _largest(ports.follower_force)
+    force += _largest(ports.line_force) * (length + segments * _largest(ports.extension))
+    force += _largest(ports.node_force) * ports.node_force.shape[1]
+    return float(math.sqrt(3.0) * force * length / params.moment_scale.min())
+
+
+def _largest(a: Floats) -> float:
+    """|a|, of one robot in a third of numpy's time."""
+    if a.size <= 16:
+        return float(max(map(abs, a.ravel().tolist()), default=0.0))
+    return float(np.abs(a).max())
 
 
 def _alike(one: Ports, other: Ports) -> bool:

@@ -3,8 +3,6 @@ carries are not ok, however they were solved; the others keep every bit."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from fastrod.errors import Problem, ProblemSentence
@@ -16,18 +14,15 @@ TOLERANCE = 1e-9  # m: that of `Simulator.settle`
 # of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those
 # of 50, and at most 2 % of those of 200. It is also three times pi^2, at which a segment whose ends the
 # tendons hold buckles: a straight rod under more is solved to rounding, but no rod stands like that.
-_HOPELESS = 30.0
+HOPELESS = 30.0
 
 
 class Boundary:
-    """The boundary before a step, kept until it is known that nobody diverged: 21 numbers of a five-segment
-    robot."""
+    """The boundary before a step, to which robots that diverged go back."""
 
-    def __init__(self, passes: BoundarySolver) -> None:
-        self._passes = passes
-        # on a GPU a copy would have to come here at every step; its robots begin from the cold guess instead
-        on_gpu = passes.device == "cuda"
-        self._kept = None if on_gpu else (passes.x.copy(), passes.memory.curvature_guess.copy())
+    def __init__(self, passes: BoundarySolver, kept: tuple[Floats, Floats] | None) -> None:
+        """`kept`: `BoundarySolver.kept` before the step."""
+        self._passes, self._kept = passes, kept
 
     def put_back(self, rows: Ints, ports: Ports) -> None:
         """These robots stand where they stood before the step, on the inputs `ports`; what the pass learned
@@ -60,7 +55,7 @@ class Boundary:
 def overloaded(params: Params, ports: Ports, row: int) -> float:
     """F l^2/EI of a robot's loads where that is beyond what a rod can hold, else 0."""
     size = float(load_parameter(np.array([row]), params, ports)[0])
-    return size if size > _HOPELESS else 0.0
+    return size if size > HOPELESS else 0.0
 
 
 def pressed(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Floats:
@@ -92,28 +87,8 @@ def pressed(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Floats
 def unstable(params: Params, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
     """Those of `rows` whose solved shape is an unstable balance, far beyond the load at which a segment
     buckles."""
-    if not len(rows) or _largest_load(params, ports) <= _HOPELESS:
-        return rows[:0]
-    rows = rows[load_parameter(rows, params, ports) > _HOPELESS]
-    return rows[pressed(params, ports, shape, rows) > _HOPELESS]
-
-
-def _largest_load(params: Params, ports: Ports) -> float:
-    """A cheap upper bound of the load parameter of all robots: a step asks for it every time. nan, where one
-    of many robots has an input that cannot be used."""
-    length, segments = _largest(params.rod_length), params.length.shape[1]
-    shortest = length if len(params.rod_length) == 1 else float(params.rod_length.min())
-    force = _largest(ports.tip_force) + _largest(ports.tip_moment) / shortest + _largest(ports.follower_force)
-    force += _largest(ports.line_force) * (length + segments * _largest(ports.extension))
-    force += _largest(ports.node_force) * ports.node_force.shape[1]
-    return float(math.sqrt(3.0) * force * length / params.moment_scale.min())
-
-
-def _largest(a: Floats) -> float:
-    """|a|, of one robot in a third of numpy's time."""
-    if a.size <= 16:
-        return float(max(map(abs, a.ravel().tolist()), default=0.0))
-    return float(np.abs(a).max())
+    rows = rows[load_parameter(rows, params, ports) > HOPELESS]
+    return rows[pressed(params, ports, shape, rows) > HOPELESS]
 
 
 FOLDS = 0.9

@@ -22,9 +22,8 @@ from ..jit import inline, kernel
 from ..vec import cross, mul, mul_t, sub
 from . import columns as col
 from . import shape as sh
-from .gather import pick, unknown_unit
+from .gather import Batch, Chunk, Mode, PassWorkspace, pick, unknown_unit
 from .lanes import BLOCK, LaneMatrix, Lanes, W, at, clear, get, get_mat, read, write, write_at
-from .workspace import Batch, Chunk, Mode, PassWorkspace
 
 
 @inline

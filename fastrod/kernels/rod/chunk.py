@@ -24,9 +24,7 @@ from .boundary import (
     release_slack_tendons,
     update_boundary,
 )
-from .gather import gather_base, gather_segment, gather_step, pick, predict, scatter, scatter_node
-from .lanes import Lanes, W, at, clear, get, get_mat, put, read, write
-from .workspace import (
+from .gather import (
     Batch,
     Chunk,
     Mode,
@@ -35,9 +33,17 @@ from .workspace import (
     RodLanes,
     Sensitivities,
     carve,
+    gather_base,
+    gather_segment,
+    gather_step,
+    pick,
+    predict,
+    scatter,
+    scatter_node,
     scratch_size,
     sizes,
 )
+from .lanes import Lanes, W, at, clear, get, get_mat, put, read, write
 
 __all__ = ["Batch", "Chunk", "Mode", "Output", "pass_chunk", "scratch_size"]
 ITERATIONS = (

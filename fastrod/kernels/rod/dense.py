@@ -9,9 +9,8 @@ from fastrod.types import Floats, Layout, Params, Ports, RodShape
 from ..jit import entry, kernel
 from . import shape as sh
 from .chunk import FIRST_ITERATIONS, finish_stages, solve_section
-from .gather import pick, scatter
+from .gather import RodLanes, pick, scatter
 from .lanes import Lanes, W, get, get_mat, write
-from .workspace import RodLanes
 
 
 @kernel

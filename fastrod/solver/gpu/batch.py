@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numba import cuda
 
-from fastrod.kernels.rod.workspace import Mode
+from fastrod.kernels.rod.gather import Mode
 from fastrod.solver.gpu.kernels.jit import SIMULATED, launched
 from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Response, RodShape
 

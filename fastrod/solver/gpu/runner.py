@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import cuda
 
-from fastrod.kernels.rod.workspace import Mode
+from fastrod.kernels.rod.gather import Mode
 from fastrod.solver.gpu.batch import all_finite, launch, move_to_inputs, pass_robots, room
 from fastrod.solver.gpu.resident import Resident, fill
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, RodShape
