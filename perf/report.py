@@ -27,7 +27,8 @@ sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "truth")]  # what benchma
 
 Value = float | int | str | bool | None
 Row = dict[str, Value]
-_WIDTH = 166  # characters of the widest table; a narrower terminal wraps its lines but loses nothing
+# characters of the widest table, whose words wrap; a narrower terminal wraps its lines but loses nothing
+_WIDTH = 166
 
 
 class Column(NamedTuple):
@@ -92,7 +93,8 @@ def show(sections: Sequence[Section], head: str) -> None:
     for section in sections:
         made = Table()
         for i, column in enumerate(section.columns):
-            made.add_column(Text(column.head), justify="left" if i == 0 else "right", no_wrap=True)
+            number = not any(isinstance(row.get(column.key), str) for row in section.rows)
+            made.add_column(Text(column.head), justify="left" if i == 0 else "right", no_wrap=number)
         for row in section.rows:
             made.add_row(*(Text(_text(row.get(column.key), column.form)) for column in section.columns))
         console.print(Text(f"\n{section.title}"), style="bold", highlight=False)
