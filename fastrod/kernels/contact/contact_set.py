@@ -91,7 +91,8 @@ def wall_at(
     normal.
 
     Where the centreline has gone through the surface, the nearest side may be the wrong one: what counts is
-    the side on which the contact was, found by going back along its normal.
+    the side on which the contact was, found by going back along its normal. A convex obstacle has no other
+    wall in front of p than the nearest.
     """
     d, n, _ = signed_distance(k, frame, p, FAR, surfaces, stack)
     if d < 0.0:
