@@ -23,11 +23,9 @@ from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Response,
 _cuda: Any = cuda
 _config: Any = numba.config
 # the same files as in fastrod.kernels.rod, for the other machine: no type checker would find them there
-_chunk, _gather, _workspace = (
-    import_module(f"fastrod.solver.gpu.kernels.rod.{name}") for name in ("chunk", "gather", "workspace")
-)
-pass_chunk, predict, scratch_size = _chunk.pass_chunk, _gather.predict, _workspace.scratch_size
-Batch, Chunk, Output = _workspace.Batch, _workspace.Chunk, _workspace.Output
+_chunk, _gather = (import_module(f"fastrod.solver.gpu.kernels.rod.{name}") for name in ("chunk", "gather"))
+pass_chunk, predict, scratch_size = _chunk.pass_chunk, _gather.predict, _gather.scratch_size
+Batch, Chunk, Output = _gather.Batch, _gather.Chunk, _gather.Output
 
 BLOCK = 64
 """Threads of a block."""
