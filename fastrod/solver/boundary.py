@@ -125,9 +125,9 @@ class BoundarySolver:
 
     @property
     def kept(self) -> tuple[Floats, Floats] | None:
-        """Return copies of x and of the guess of the curvature, 21 numbers of a five-segment robot, for when
-        it diverges. None on a GPU, from where they would have to come at every step: its robots begin from
-        the cold guess."""
+        """(n_robots, n_x) and (n_robots, 3) copies of x and of the guess of the curvature at the base,
+        material [1/m], for robots that diverge. None on a GPU, from where they would have to come at every
+        step: its robots begin from the cold guess."""
         return None if self.device == "cuda" else (self.x.copy(), self.memory.curvature_guess.copy())
 
     def peek(self) -> Memory:

@@ -52,7 +52,7 @@ def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
         if len(args) - 1 > positional:
             raise InputError(
                 f"{called} takes {positional} of its inputs without a name and was given {len(args) - 1}; "
-                "name the others, as in tip_force=..."
+                f"name the others, as in {list(parameters)[-1]}=..."
             )
         return (of_many if getattr(args[0], "n_robots", 0) > FEW else function)(*args, **inputs)
 
