@@ -45,7 +45,7 @@ def found(name: str) -> Result:
     return identify(replace(log, tip_position=tip), robot, threads=1)
 
 
-def test_an_effect_with_which_the_rod_is_lost_is_none() -> None:
+def test_an_effect_with_which_the_rod_is_lost_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little it leaves: samples at which the rod finds no balance do not count."""
     robot, n = one_segment(), 60
     log = log_of(robot, wave(robot, n, dt=0.1, size=0.9), 0.1)
@@ -60,9 +60,22 @@ def test_an_effect_with_which_the_rod_is_lost_is_none() -> None:
     far = np.clip(fit.theta, *candidate.state.model.limits)
     far[-4:] = candidate.state.model.limits[1][-4:]  # as stiff, and to a point as far off, as can be
     lost = replace(candidate, state=replace(candidate.state, fit=replace(fit, theta=far)))
+    monkeypatch.setattr(Search, "_followed", lambda *_: True)  # it would come back from there
     refused = search._exact(state, lost)
     assert refused.state is None
     assert refused.why.startswith("with it the rod finds no balance at ")
+
+
+def test_an_effect_is_whole_beside_however_much_is_left() -> None:
+    """What moves nothing beyond the noise is left out; what is left before it is found is none."""
+    robot, n, left = one_segment(), 60, np.full(3, 0.05)
+    log = log_of(robot, wave(robot, n, dt=0.1))
+    samples, model = sample(replace(log, tip_position=replay(log, robot).tip_position)), base_model(robot)
+    target, block = target_of(samples, left, rotation_sigma=0.01, points=False), np.arange(n) * N_BLOCKS // n
+    search = Search(samples, PredictedRod(samples, robot), target, block, noise=np.full(3, NOISE))
+    state, more = search.start(model, model.start), model.with_effect("frame_misalignment")
+    assert search._unseen(state, more) == []
+    assert "rotation_z" in replace(search, noise=left)._unseen(state, more)
 
 
 @pytest.mark.study

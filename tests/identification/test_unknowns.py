@@ -188,9 +188,9 @@ def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
     assert_array_equal(values["drum_gain"], [0.02] * 4)
     assert_allclose(values["friction"][:4], 3e-4, rtol=1e-12)  # one number for all drives
     assert values["friction"][5] == 0.0  # left out: neutral
-    split = model.with_effect("friction", split=True)
-    widths = [name for name in names(split) if "half_width" in name]
-    assert widths == [f"friction.half_width_{k}" for k in range(1, 5)]
+    alike = model.with_effect("routing_angle", alike=True)
+    assert names(alike)[2:] == ["routing_angle.angle"]
+    assert (alike.alike("routing_angle"), more.alike("friction")) == (True, False)
     back = more.without("friction")
     assert (back.effects, names(back)) == (model.effects, names(model))
 
@@ -198,9 +198,8 @@ def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
 @pytest.mark.parametrize("name", effect_names())
 def test_every_effect_of_the_library_can_be_unknown(name: str) -> None:
     robot = two_segments()
-    found = effect_unknowns(name, route(robot), split=True)
-    assert len(found) == len(columns(get_effect(name), route(robot)))
-    model = base_model(robot).with_effect(name, split=True)
+    found = effect_unknowns(name, route(robot))
+    model = base_model(robot).with_effect(name)
     low, high = model.limits
     assert (low <= model.start).all()
     assert (model.start <= high).all()
@@ -208,8 +207,10 @@ def test_every_effect_of_the_library_can_be_unknown(name: str) -> None:
         assert math.isfinite(u.sd)
         assert u.sd > 0.0
         assert u.bounds[0] <= u.mean <= u.bounds[1]
+    starts = {int(column): u.start for u in found for column in u.place[2:]}
+    assert sorted(starts) == [*range(len(columns(get_effect(name), route(robot))))]
     values = model.values(model.start)[name]
-    assert_allclose(values, [u.start for u in found], rtol=1e-12)
+    assert_allclose(values, [starts[column] for column in sorted(starts)], rtol=1e-12)
 
 
 def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
@@ -225,7 +226,7 @@ def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
         effects=({"name": "coupling", "from_distal": 0.05},),
     )
     model = base_model(robot).with_effect("stiffening").with_effect("payload")
-    model = model.with_effect("tendon_stretch", split=True)
+    model = model.with_effect("tendon_stretch")
     step = 0.5 * np.minimum(model.prior[1], 0.2) * np.random.default_rng(7).normal(size=len(model.unknowns))
     theta = np.clip(model.start + step, *model.limits)
     made = model.identified(theta)

@@ -21,6 +21,7 @@ _LONG_SETTLE = 3.0  # s, where what is seen at rest is slow: creep and ringing a
 _LONG_ENOUGH = 90  # samples that must be left then
 _TO_SIGMA = 1.4826  # of a median absolute deviation
 _KNOWN = 0.05  # a noise that rests tell to this is looked for nowhere else
+_OVERFITTED = 0.05  # of white noise, which a model may leave less by
 _WITHIN = 2.0  # standard errors of the noise at rest
 WHITE = AutoRegression()
 """Samples that know nothing of each other."""
@@ -57,9 +58,10 @@ class Noise:
         return self.floor * (1.0 + 2.0 * float(np.hypot(self.uncertainty, 1.0 / np.sqrt(6.0 * rows))))
 
     def below(self, error: float) -> Noise:
-        """Coloured noise no larger than the `error` [m] that a model leaves: rests bound slow noise but
-        loosely. White noise stays as it was read."""
-        if not self.model.order or not 0.0 < error < self.floor:
+        """Noise no larger than the `error` [m] that a model leaves. Rests bound slow noise but loosely; of
+        white noise they say too much only where the robot still moves in them, as with a lag."""
+        sure = 1.0 if self.model.order else 1.0 - max(_OVERFITTED, _WITHIN * self.uncertainty)
+        if not 0.0 < error < sure * self.floor:
             return self
         return replace(self, sigma=self.sigma * (error / self.floor))
 

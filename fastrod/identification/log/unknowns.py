@@ -130,12 +130,13 @@ class Model:
         name: str,
         start: Mapping[str, float] | None = None,
         drop: Sequence[str] = (),
-        split: bool = False,
         drive: int | None = None,
+        alike: bool = False,
     ) -> Model:
         """This model with one more effect, all its parameters unknown but those named in `drop`, which stay
-        neutral. With `drive` (from 0 on) only that drive has it."""
-        added = effect_unknowns(name, self.wiring, start or {}, drop, split, drive)
+        neutral. With `drive` (from 0 on) only that drive has it; with `alike` all drives have it in one
+        size."""
+        added = effect_unknowns(name, self.wiring, start or {}, drop, drive, alike)
         names = tuple(known for known in effect_names() if known in (*self.effects, name))
         return replace(self, effects=names, unknowns=self.unknowns + added)
 
@@ -154,6 +155,11 @@ class Model:
                 if label in shared:
                     return int(number) - 1
         return None
+
+    def alike(self, name: str) -> bool:
+        """Whether all drives have an effect in one size that may differ between them."""
+        own = {p.name for p in get_effect(name).parameters if p.per == "drive" and not p.shared}
+        return any(u.place[:2] == ("effect", name) and u.name.partition(".")[2] in own for u in self.unknowns)
 
     def values(self, theta: Floats, session: int = 0) -> dict[str, Floats]:
         """Effect name -> (n_columns,) values in a session at the fitted numbers `theta` (p,); what is not
@@ -222,12 +228,12 @@ def effect_unknowns(
     wiring: Routing,
     start: Mapping[str, float] | None = None,
     drop: Sequence[str] = (),
-    split: bool = False,
     drive: int | None = None,
+    alike: bool = False,
 ) -> tuple[Unknown, ...]:
-    """The parameters of an effect as unknowns; one for all segments, and of `shared` ones for all drives, or
-    with `split` one for each. With `drive` the `shared` ones are of that drive alone, from 0 on; those of
-    other drives stay neutral."""
+    """The parameters of an effect as unknowns; one for all segments, and of `shared` ones, or where drives
+    are `alike`, one for all drives. With `drive` the `shared` ones are of that drive alone, from 0 on; those
+    of other drives stay neutral."""
     found = []
     at = 0
     every = columns(get_effect(name), wiring)
@@ -236,8 +242,8 @@ def effect_unknowns(
         count = wiring.count(parameter.per)
         own = range(at, at + count)
         at += count
-        alike = (parameter.per == "segment" and not parameter.apart) or parameter.shared
-        tied = alike and not split and count > 0
+        one = (parameter.per == "segment" and not parameter.apart) or parameter.shared
+        tied = (one or (alike and parameter.per == "drive" and not parameter.shape)) and count > 0
         groups = [(parameter.name, tuple(own))] if tied else [(every[c], (c,)) for c in own]
         if parameter.shared and drive is not None:
             groups = [(every[at - count + drive], (at - count + drive,))]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fastrod.effects.base import get_effect, has_memory
+from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedPose
 from fastrod.identification.log.noise import keep
@@ -21,7 +21,13 @@ from fastrod.identification.report.signature import signatures
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
-from fastrod.identification.search.model_selection import BIC_STRONG, Z_ACCEPT, ModelState, SearchStep
+from fastrod.identification.search.model_selection import (
+    BIC_STRONG,
+    Z_ACCEPT,
+    ModelState,
+    SearchStep,
+    oversized,
+)
 from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
 from fastrod.identification.search.search import MOST_OF, Search, SearchOutcome, lost_with_it
@@ -36,7 +42,6 @@ ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
 _MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
 _MOST_ADVICE = 5  # runs
-_BEYOND = 7.0  # times a typical size: no tendon's friction or play is so large
 # of the held-out error: in two blocks of OpenCR's log the friction of the body took 4 and 6 % off it
 _FALLS = 0.97
 _DRAWN = 3  # rivals of an effect
@@ -273,6 +278,7 @@ def assemble(
             *log.drives,
             *base.notes,
             *outcome.notes,
+            *(outcome.perhaps if kept else ()),
             *_of_sessions(final),
             *_left_out(explained, test_error),
         ],
@@ -285,14 +291,11 @@ def assemble(
 def _stand_ins(names: Sequence[str], state: ModelState) -> list[str]:
     """Laws of memory that are larger than any tendon or body, in sentences."""
     said = []
-    for u, number in zip(state.model.unknowns, state.theta, strict=True):
-        if u.place[0] != "effect" or u.place[1] not in names or not has_memory(get_effect(u.place[1])):
-            continue
-        value = u.inside(float(number))
-        if u.unit in ("m", "") and abs(value) > _BEYOND * u.scale:
+    for name in names:
+        for u, value in oversized(state, name):
             size = f"{plain_name(u.name)} comes out at {amount(value, u.unit)}"
             usual = f"{abs(value) / u.scale:.0f} times what is usual"
-            said.append(f"{size}, {usual}: {words(u.place[1])} stands in for something else.")
+            said.append(f"{size}, {usual}: {words(name)} stands in for something else.")
     return said
 
 

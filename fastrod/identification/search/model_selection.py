@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.effects.base import get_effect, trait
-from fastrod.identification.log.unknowns import Model
+from fastrod.effects.base import get_effect, has_memory, trait
+from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.alternatives import AlternativePattern
 from fastrod.identification.search.linearised import LinearisedModel
 from fastrod.identification.search.solve import Fit, bic, covariance, effective_size, paired
@@ -29,6 +29,7 @@ Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 # standard errors from a law that another one contains: nearer it is that law, further the richer one
 NEAR_SUB_LAW, FAR_FROM_SUB_LAW = 2.0, 3.0
 AT_NOISE = 1.1**2  # of a loss: what "explained" is, too
+_BEYOND = 7.0  # times a typical size: no tendon's friction or play is so large
 _MUCH = 300.0  # BIC by which a richer law is better, whatever its numbers: the contained one does not fit
 
 
@@ -198,6 +199,17 @@ def by_estimate(
             first = best.name in (rich.name, name)
             best, *rivals = [kept, *others] if first else [*others, kept]
     return [best, *rivals]
+
+
+def oversized(state: ModelState, name: str) -> list[tuple[Unknown, float]]:
+    """Sizes of a law of memory that are larger than any tendon or body has, with what they come out at: it
+    stands in for something else."""
+    made = []
+    for u, number in zip(state.model.unknowns, state.theta, strict=True):
+        value = u.inside(float(number))
+        own = u.place[:2] == ("effect", name) and u.unit in ("m", "") and has_memory(get_effect(name))
+        made += [(u, value)] if own and abs(value) > _BEYOND * u.scale else []
+    return made
 
 
 def unphysical(state: ModelState, name: str) -> str:

@@ -43,6 +43,7 @@ from fastrod.identification.search.model_selection import (
     best_of,
     by_estimate,
     equally_wrong,
+    oversized,
     unfitted,
     unphysical,
     z_between,
@@ -76,6 +77,9 @@ _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _BACK = 4  # times that a step is halved which has led to where the solved rod fits worse
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
+_SLOPES = 0.25**2  # of the loss: slopes may be off by a quarter of what an effect moves
+_ROUNDS = 5  # solutions of a candidate after the first
+_CONVERGED = 0.9  # of the loss where it was solved: less than slopes promise there
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
 # of an alternative pattern's amplitude, in units of its own columns' size that would explain all
 _ALTERNATIVE_SD = 30.0
@@ -289,8 +293,9 @@ class Search:
         return best if promises[best] >= _SCREEN * state.fit.loss else None
 
     def _candidate(self, state: ModelState, name: str, drive: int | None = None) -> Candidate:
-        drop = self._unseen(state, name, drive)
-        added = state.model.with_effect(name, drive=drive).unknowns[len(state.model.unknowns) :]
+        whole = state.model.with_effect(name, drive=drive)
+        drop = self._unseen(state, whole)
+        added = whole.unknowns[len(state.model.unknowns) :]
         if all(u.name.partition(".")[2] in drop for u in added if not u.shape):
             shown_by = trait(get_effect(name), "excited_by") or "no response"
             return unfitted(name, f"this log does not excite it: {shown_by}")
@@ -301,9 +306,10 @@ class Search:
             return unfitted(name, "its slopes promise nothing", n_more)
         return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
-    def _unseen(self, state: ModelState, name: str, drive: int | None) -> list[str]:
-        """Size parameters of an effect that this log does not move at all: left at neutral."""
-        model = state.model.with_effect(name, drive=drive)
+    def _unseen(self, state: ModelState, model: Model) -> list[str]:
+        """Size parameters of the effect that a model has more that move nothing in this log beyond its noise:
+        left at neutral. Beside what is left before it is found they may be small, and yet be its
+        direction."""
         n = len(state.model.unknowns)
         theta = np.concatenate([state.theta, model.start[n:]])
         at_zero = theta.copy()
@@ -311,13 +317,14 @@ class Search:
             if not u.shape:
                 at_zero[j] = u.mean
         base = state.linearised.residual(model, at_zero)
+        of_noise = max(1.0, float(np.mean((self.target.sigma / self.noise) ** 2)))
         unseen = []
         for j, u in enumerate(model.unknowns[n:], n):
             if u.shape:
                 continue
             moved = at_zero.copy()
             moved[j] = np.clip(u.mean + u.scale, *u.limits)
-            if float(((state.linearised.residual(model, moved) - base) ** 2).sum()) < 4.0:
+            if of_noise * float(((state.linearised.residual(model, moved) - base) ** 2).sum()) < 4.0:
                 unseen.append(u.name.partition(".")[2])
         return unseen
 
@@ -391,14 +398,33 @@ class Search:
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
     def _exact(self, state: ModelState, candidate: Candidate) -> Candidate:
-        """A fitted candidate with the rod solved at its parameters. Samples at which the rod then finds no
-        balance do not count, and the worse an effect is the fewer would: with many it is none."""
+        """A fitted candidate with the rod solved at its parameters, as often as slopes there promise more; in
+        one size for all drives where that does as well. Samples at which the rod then finds no balance do not
+        count, and the worse an effect is the fewer would: with many it is none."""
         assert candidate.state is not None
+        name, slow = candidate.name, self.in_motion or self.rod.of_modes
         with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
+        for _ in range(0 if slow else _ROUNDS):
+            with_it = with_it if self._followed(with_it) else self.refined(with_it)
         poses = state.linearised.pose, with_it.linearised.pose
         if not self.in_motion and (why := lost_with_it(*(pose.ok for pose in poses))):
-            return unfitted(candidate.name, why, candidate.n_parameters)
-        return self.judged(state, with_it, candidate.name)
+            return unfitted(name, why, candidate.n_parameters)
+        found = self.judged(state, with_it, name)
+        if not slow and found.passes and _differs(name) and not with_it.model.alike(name):
+            model = state.model.with_effect(name, alike=True)
+            values, added = with_it.model.values(with_it.theta)[name], model.unknowns[len(state.theta) :]
+            begin = [u.outside(float(np.mean(values[[int(c) for c in u.place[2:]]]))) for u in added]
+            theta, rest = np.split(with_it.fit.theta, [len(with_it.theta)])
+            theta = np.concatenate([theta[: len(state.theta)], begin])
+            one = self.judged(state, self._fitted(model, theta, rest, state.alternatives, _FEW), name)
+            found = one if one.passes and _as_good(one, found) else found
+        return found
+
+    def _followed(self, state: ModelState) -> bool:
+        """Whether slopes promise little more than the rod left where it was solved."""
+        linearised, n = state.linearised, len(state.theta)
+        there = linearised.residual(linearised.model, linearised.theta) - state.columns @ state.fit.theta[n:]
+        return state.fit.loss > _CONVERGED * float((there**2).sum())
 
     def _worth(self, state: ModelState) -> float:
         """Samples that a state's residual is worth, of which coloured noise leaves fewer."""
@@ -528,9 +554,8 @@ class Search:
             key=lambda c: -c.fraction,
         )
         most = fitted[0].fraction if fitted else 0.0
-        near = [c for c in fitted if 1.0 - c.fraction < _NEAR * (1.0 - most) and c.fraction > most / _NEAR][
-            :_REFINED
-        ]
+        far = _NEAR * (1.0 - most) + (0.0 if self.in_motion or self.rod.of_modes else _SLOPES)
+        near = [c for c in fitted if 1.0 - c.fraction < far and c.fraction > most / _NEAR][:_REFINED]
         # of these even the fit so far is linear
         heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
         exact = {c.name: self._exact(state, c) for c in dict.fromkeys([*near, *heavy])}
@@ -583,9 +608,12 @@ class Search:
         return equally_wrong(before, least, more, self._noise_loss(best), fewer)
 
     def _stands_in(self, candidate: Candidate) -> bool:
-        """Whether it is a force that goes by where the tip is, and leaves more than noise: with its numbers
-        it bends to many a compound of other effects, which is then not found."""
+        """Whether it is a force that goes by where the tip is, and leaves more than noise, or a memory larger
+        than any: with their numbers they bend to many a compound of other effects, which is then not
+        found."""
         assert candidate.state is not None
+        if oversized(candidate.state, candidate.name):
+            return True
         left, noise = float(candidate.state.losses.sum()), self._noise_loss(candidate)
         return bool(trait(get_effect(candidate.name), "feels_tip")) and left > AT_NOISE * noise
 
@@ -597,7 +625,8 @@ class Search:
 
     def beside(self, state: ModelState, name: str, found: ModelState) -> ModelState:
         """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
-        model = state.model.with_effect(name, drive=found.model.drive_of(name))
+        drive, alike = found.model.drive_of(name), found.model.alike(name)
+        model = state.model.with_effect(name, drive=drive, alike=alike)
         theta = np.concatenate([state.theta, found.from_here(model)[len(state.theta) :]])
         fit = self._fit(state.linearised, model, theta, np.zeros(0), (), _MANY)
         return self._state(model, state.linearised, fit, ())
@@ -615,13 +644,14 @@ class Search:
 
     def eliminated(
         self, state: ModelState, found: Sequence[str], least: float, noise: float
-    ) -> tuple[ModelState, list[str]]:
+    ) -> tuple[ModelState, list[str], list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where
         what is left is of the size of the `noise` [both m^2 summed over the residual] and they do not explain
-        it: beside a dominant effect they only correct its form. The state, and who is left."""
-        left = list(found)
+        it: beside a dominant effect they may only correct its form. The state, who is left, and a sentence on
+        each that was needed and dropped."""
+        left, said = list(found), list[str]()
         while len(left) > 1:
-            weakest: tuple[float, str, ModelState] | None = None
+            weakest: tuple[float, str, ModelState, str] | None = None
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
@@ -634,11 +664,14 @@ class Search:
                 explains = after < AT_NOISE * noise <= before  # the log is explained with it, and not without
                 small = before - after < least and before < 2.0 * noise and not explains
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
-                    weakest = verdict.bic_gain, name, fewer
+                    ratios = (float(np.sqrt(size / noise)) for size in (after, before))
+                    why = "" if needless else _perhaps(name, verdict.z, *ratios)
+                    weakest = verdict.bic_gain, name, fewer, why
             if weakest is None:
                 break
-            state, left = weakest[2], [name for name in left if name != weakest[1]]
-        return state, left
+            _, dropped, state, why = weakest
+            left, said = [name for name in left if name != dropped], [*said, *([why] if why else [])]
+        return state, left, said
 
     def again_beside_all(
         self, state: ModelState, found: Sequence[str], steps: Sequence[SearchStep]
@@ -718,6 +751,22 @@ class Search:
                 for key, size in worst.items()
             ]
         return made
+
+
+def _perhaps(name: str, z: float, with_it: float, without: float) -> str:
+    """The sentence on an effect that is there, or corrects the form of a larger one; of the noise it leaves
+    `with_it`, and the others alone `without`."""
+    return (
+        f"{name.replace('_', ' ')} may be there, too: with it the model leaves {with_it:.2f} of the noise, "
+        f"without it {without:.2f} (z {z:.1f}). So small an effect may also be an error in the form of a "
+        "larger one's law, and is not named"
+    )
+
+
+def _differs(name: str) -> bool:
+    """Whether a law has a size of its own for each drive, which may be one for all."""
+    own = any(p.per == "drive" and not (p.shared or p.shape) for p in get_effect(name).parameters)
+    return own and not trait(get_effect(name), "last_resort")
 
 
 def _numbers(model: Model, name: str) -> int:
@@ -813,3 +862,5 @@ class SearchOutcome:
     """Names of these effects."""
     steps: tuple[SearchStep, ...]
     notes: tuple[str, ...] = ()
+    perhaps: tuple[str, ...] = ()
+    """A sentence on each effect that is too small beside these to be named."""
