@@ -60,7 +60,7 @@ def test_an_effect_with_which_the_rod_is_lost_is_none(monkeypatch: pytest.Monkey
     far = np.clip(fit.theta, *candidate.state.model.limits)
     far[-4:] = candidate.state.model.limits[1][-4:]  # as stiff, and to a point as far off, as can be
     lost = replace(candidate, state=replace(candidate.state, fit=replace(fit, theta=far)))
-    monkeypatch.setattr(Search, "_followed", lambda *_: True)  # it would come back from there
+    monkeypatch.setattr(Search, "_left", lambda *_: 0.0)  # it would come back from there
     refused = search._exact(state, lost)
     assert refused.state is None
     assert refused.why.startswith("with it the rod finds no balance at ")

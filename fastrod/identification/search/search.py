@@ -78,6 +78,7 @@ _BACK = 4  # times that a step is halved which has led to where the solved rod f
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _SLOPES = 0.25**2  # of the loss: slopes may be off by a quarter of what an effect moves
+_ALONE = 3.0  # of what noise leaves: one effect that is said to leave less may explain a log
 _ROUNDS = 5  # solutions of a candidate after the first
 _CONVERGED = 0.9  # of the loss where it was solved: less than slopes promise there
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
@@ -397,34 +398,53 @@ class Search:
             )
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
-    def _exact(self, state: ModelState, candidate: Candidate) -> Candidate:
-        """A fitted candidate with the rod solved at its parameters, as often as slopes there promise more; in
-        one size for all drives where that does as well. Samples at which the rod then finds no balance do not
-        count, and the worse an effect is the fewer would: with many it is none."""
+    def _exact(self, state: ModelState, candidate: Candidate, *, far: bool = False) -> Candidate:
+        """A fitted candidate with the rod solved at its parameters; again where these led `far` or promise
+        much. In one size for all drives where that does as well."""
         assert candidate.state is not None
         name, slow = candidate.name, self.in_motion or self.rod.of_modes
         with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
-        for _ in range(0 if slow else _ROUNDS):
-            with_it = with_it if self._followed(with_it) else self.refined(with_it)
+        if not slow and (far or with_it.fit.loss < 0.5 * candidate.state.fit.loss):
+            with_it = self._arrived(with_it, far=far)
+        found = self._balanced(state, with_it, name)
+        if slow or not found.passes or not _differs(name) or with_it.model.alike(name):
+            return found
+        model = state.model.with_effect(name, alike=True)
+        values, added = with_it.model.values(with_it.theta)[name], model.unknowns[len(state.theta) :]
+        begin = [u.outside(float(np.mean(values[[int(c) for c in u.place[2:]]]))) for u in added]
+        theta, amplitudes = np.split(with_it.fit.theta, [len(with_it.theta)])
+        theta = np.concatenate([theta[: len(state.theta)], begin])
+        alike = self._fitted(model, theta, amplitudes, state.alternatives, _FEW)
+        one = self._balanced(state, alike, name)
+        return one if one.passes and _as_good(one, found) else found
+
+    def _balanced(self, state: ModelState, with_it: ModelState, name: str) -> Candidate:
+        """The candidate of a state at which the rod was solved. Samples at which it then finds no balance do
+        not count, and the worse an effect is the fewer would: with many it is none."""
         poses = state.linearised.pose, with_it.linearised.pose
         if not self.in_motion and (why := lost_with_it(*(pose.ok for pose in poses))):
-            return unfitted(name, why, candidate.n_parameters)
-        found = self.judged(state, with_it, name)
-        if not slow and found.passes and _differs(name) and not with_it.model.alike(name):
-            model = state.model.with_effect(name, alike=True)
-            values, added = with_it.model.values(with_it.theta)[name], model.unknowns[len(state.theta) :]
-            begin = [u.outside(float(np.mean(values[[int(c) for c in u.place[2:]]]))) for u in added]
-            theta, rest = np.split(with_it.fit.theta, [len(with_it.theta)])
-            theta = np.concatenate([theta[: len(state.theta)], begin])
-            one = self.judged(state, self._fitted(model, theta, rest, state.alternatives, _FEW), name)
-            found = one if one.passes and _as_good(one, found) else found
-        return found
+            return unfitted(name, why, len(with_it.fit.theta) - len(state.fit.theta))
+        return self.judged(state, with_it, name)
 
-    def _followed(self, state: ModelState) -> bool:
-        """Whether slopes promise little more than the rod left where it was solved."""
+    def _arrived(self, state: ModelState, *, far: bool) -> ModelState:
+        """The state with the rod solved again as long as slopes promise more and, unless they led `far`, what
+        is left halves; as it was where that does not end near the noise."""
+        here = state
+        for _ in range(_ROUNDS):
+            left = self._left(here)
+            if here.fit.loss > _CONVERGED * left:
+                break
+            there = self.refined(here)
+            if not far and self._left(there) > 0.5 * left:
+                break
+            here = there
+        return here if here.fit.loss < _ALONE * self._noise_loss(here) else state
+
+    def _left(self, state: ModelState) -> float:
+        """Loss where the rod was solved, before the state's last fit."""
         linearised, n = state.linearised, len(state.theta)
         there = linearised.residual(linearised.model, linearised.theta) - state.columns @ state.fit.theta[n:]
-        return state.fit.loss > _CONVERGED * float((there**2).sum())
+        return float((there**2).sum())
 
     def _worth(self, state: ModelState) -> float:
         """Samples that a state's residual is worth, of which coloured noise leaves fewer."""
@@ -554,15 +574,18 @@ class Search:
             key=lambda c: -c.fraction,
         )
         most = fitted[0].fraction if fitted else 0.0
-        far = _NEAR * (1.0 - most) + (0.0 if self.in_motion or self.rod.of_modes else _SLOPES)
-        near = [c for c in fitted if 1.0 - c.fraction < far and c.fraction > most / _NEAR][:_REFINED]
+        # where one may explain the log alone, slopes do not say which
+        alone = (1.0 - most) * state.fit.loss < _ALONE * self._noise_loss(state)
+        far = alone and not (self.in_motion or self.rod.of_modes)
+        least = 1.0 - _NEAR * (1.0 - most) - (_SLOPES if far else 0.0)
+        near = [c for c in fitted if c.fraction > least and c.fraction > most / _NEAR][:_REFINED]
         # of these even the fit so far is linear
         heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
-        exact = {c.name: self._exact(state, c) for c in dict.fromkeys([*near, *heavy])}
+        exact = {c.name: self._exact(state, c, far=far) for c in dict.fromkeys([*near, *heavy])}
         best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
-                exact[name] = self._exact(state, candidate)
+                exact[name] = self._exact(state, candidate, far=far)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         passing = [c for c in passing if not self._stands_in(c)] or passing
@@ -593,7 +616,7 @@ class Search:
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
-        return by_estimate(best, rivals, tried, self._noise_loss(best))
+        return by_estimate(best, rivals, tried, self._noise_loss(state))
 
     def _rival(self, state: ModelState, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
@@ -605,7 +628,7 @@ class Search:
         assert best.state is not None
         before, least, more = (float(s.losses.sum()) for s in (state, best.state, other.state))
         fewer = best.n_parameters - other.n_parameters
-        return equally_wrong(before, least, more, self._noise_loss(best), fewer)
+        return equally_wrong(before, least, more, self._noise_loss(state), fewer)
 
     def _stands_in(self, candidate: Candidate) -> bool:
         """Whether it is a force that goes by where the tip is, and leaves more than noise, or a memory larger
@@ -614,14 +637,13 @@ class Search:
         assert candidate.state is not None
         if oversized(candidate.state, candidate.name):
             return True
-        left, noise = float(candidate.state.losses.sum()), self._noise_loss(candidate)
+        left, noise = float(candidate.state.losses.sum()), self._noise_loss(candidate.state)
         return bool(trait(get_effect(candidate.name), "feels_tip")) and left > AT_NOISE * noise
 
-    def _noise_loss(self, of: Candidate) -> float:
-        """Return what noise alone leaves of a candidate's held-out loss."""
-        assert of.state is not None
-        sigma = of.state.linearised.target.sigma
-        return of.state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
+    def _noise_loss(self, state: ModelState) -> float:
+        """Return what noise alone leaves of a state's loss."""
+        sigma = state.linearised.target.sigma
+        return state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
 
     def beside(self, state: ModelState, name: str, found: ModelState) -> ModelState:
         """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
