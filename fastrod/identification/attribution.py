@@ -418,7 +418,7 @@ def _stopped(stages: int, seconds: float) -> str:
 def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> SearchOutcome:
     """The effects that are needed once alternative patterns are gone, with their state."""
     search, state, found, steps = all_found.search, all_found.last, [*all_found.names], [*all_found.steps]
-    alone, perhaps, begun = base.start, list[str](), time.process_time()
+    alone, suspected, begun = base.start, list[str](), time.process_time()
     if found:
         alone = search.bare(state) if state.alternatives else state
         noise = base.start.fit.residual.size * float((base.noise.sigma**2).mean())
@@ -437,12 +437,12 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
         if len(found) > 1:
             excess = base.start.fit.loss * float((base.search.target.sigma**2).mean()) - noise
             least = _MIN_GAIN * max(excess, 0.0)
-            alone, found, perhaps = search.eliminated(alone, found, least, noise)
+            alone, found, suspected = search.eliminated(alone, found, least, noise)
             alone, kept, again = search.again_beside_all(alone, found, steps)
             steps += again
             if kept != found:
                 alone, found, more = search.eliminated(alone, kept, least, noise)
-                perhaps += more
+                suspected += more
         while len(found) > max_effects:
             fewer = {name: search.without(alone, name) for name in found}
             weakest = min(fewer, key=lambda name: fewer[name].fit.loss)
@@ -460,7 +460,7 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
         state=alone if found else base.start,
         names=tuple(found),
         steps=tuple(steps),
-        perhaps=tuple(perhaps),
+        suspected=tuple(suspected),
         notes=(*all_found.notes, *([stopped] if search.spent else [])),
     )
 

@@ -48,7 +48,8 @@ def any_robot(rng: np.random.Generator) -> Robot:
 
 
 def effect(rng: np.random.Generator, name: str, robot: Robot, share: float = 1.0) -> dict[str, Any]:
-    """The effect in up to three times its typical size, to either side where it has two."""
+    """The effect, as a table of a robot file: `share` of one to three times its typical size, to either side
+    where it has two."""
     made: dict[str, Any] = {"name": name}
     for parameter in get_effect(name).parameters:
         here = parameter.on(route(robot))

@@ -278,7 +278,7 @@ def assemble(
             *log.drives,
             *base.notes,
             *outcome.notes,
-            *(outcome.perhaps if kept else ()),
+            *(outcome.suspected if kept else ()),
             *_of_sessions(final),
             *_left_out(explained, test_error),
         ],

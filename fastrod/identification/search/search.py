@@ -398,14 +398,15 @@ class Search:
             )
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
-    def _exact(self, state: ModelState, candidate: Candidate, *, far: bool = False) -> Candidate:
-        """A fitted candidate with the rod solved at its parameters; again where these led `far` or promise
-        much. In one size for all drives where that does as well."""
+    def _exact(self, state: ModelState, candidate: Candidate, *, thorough: bool = False) -> Candidate:
+        """A fitted candidate with the rod solved at its parameters; solved again where `thorough`, or where
+        the first solution promises half of what the slopes did. In one size for all drives where that does as
+        well."""
         assert candidate.state is not None
         name, slow = candidate.name, self.in_motion or self.rod.of_modes
         with_it = self.refined(candidate.state, borrow=self.rod.of_modes)
-        if not slow and (far or with_it.fit.loss < 0.5 * candidate.state.fit.loss):
-            with_it = self._arrived(with_it, far=far)
+        if not slow and (thorough or with_it.fit.loss < 0.5 * candidate.state.fit.loss):
+            with_it = self._converged(with_it, thorough=thorough)
         found = self._balanced(state, with_it, name)
         if slow or not found.passes or not _differs(name) or with_it.model.alike(name):
             return found
@@ -426,16 +427,16 @@ class Search:
             return unfitted(name, why, len(with_it.fit.theta) - len(state.fit.theta))
         return self.judged(state, with_it, name)
 
-    def _arrived(self, state: ModelState, *, far: bool) -> ModelState:
-        """The state with the rod solved again as long as slopes promise more and, unless they led `far`, what
-        is left halves; as it was where that does not end near the noise."""
+    def _converged(self, state: ModelState, *, thorough: bool) -> ModelState:
+        """The state with the rod solved again as long as slopes promise more and, unless `thorough`, what is
+        left halves; as it was where that does not end near the noise."""
         here = state
         for _ in range(_ROUNDS):
             left = self._left(here)
             if here.fit.loss > _CONVERGED * left:
                 break
             there = self.refined(here)
-            if not far and self._left(there) > 0.5 * left:
+            if not thorough and self._left(there) > 0.5 * left:
                 break
             here = there
         return here if here.fit.loss < _ALONE * self._noise_loss(here) else state
@@ -576,16 +577,16 @@ class Search:
         most = fitted[0].fraction if fitted else 0.0
         # where one may explain the log alone, slopes do not say which
         alone = (1.0 - most) * state.fit.loss < _ALONE * self._noise_loss(state)
-        far = alone and not (self.in_motion or self.rod.of_modes)
-        least = 1.0 - _NEAR * (1.0 - most) - (_SLOPES if far else 0.0)
+        thorough = alone and not (self.in_motion or self.rod.of_modes)
+        least = 1.0 - _NEAR * (1.0 - most) - (_SLOPES if thorough else 0.0)
         near = [c for c in fitted if c.fraction > least and c.fraction > most / _NEAR][:_REFINED]
         # of these even the fit so far is linear
         heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
-        exact = {c.name: self._exact(state, c, far=far) for c in dict.fromkeys([*near, *heavy])}
+        exact = {c.name: self._exact(state, c, thorough=thorough) for c in dict.fromkeys([*near, *heavy])}
         best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
-                exact[name] = self._exact(state, candidate, far=far)
+                exact[name] = self._exact(state, candidate, thorough=thorough)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         passing = [c for c in passing if not self._stands_in(c)] or passing
@@ -687,7 +688,7 @@ class Search:
                 small = before - after < least and before < 2.0 * noise and not explains
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     ratios = (float(np.sqrt(size / noise)) for size in (after, before))
-                    why = "" if needless else _perhaps(name, verdict.z, *ratios)
+                    why = "" if needless else _suspicion(name, verdict.z, *ratios)
                     weakest = verdict.bic_gain, name, fewer, why
             if weakest is None:
                 break
@@ -775,7 +776,7 @@ class Search:
         return made
 
 
-def _perhaps(name: str, z: float, with_it: float, without: float) -> str:
+def _suspicion(name: str, z: float, with_it: float, without: float) -> str:
     """The sentence on an effect that is there, or corrects the form of a larger one; of the noise it leaves
     `with_it`, and the others alone `without`."""
     return (
@@ -884,5 +885,5 @@ class SearchOutcome:
     """Names of these effects."""
     steps: tuple[SearchStep, ...]
     notes: tuple[str, ...] = ()
-    perhaps: tuple[str, ...] = ()
+    suspected: tuple[str, ...] = ()
     """A sentence on each effect that is too small beside these to be named."""
