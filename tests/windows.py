@@ -74,9 +74,9 @@ class Window:
         return row.locator("[role=slider]").first
 
     def slide(self, label: str, key: str, times: int = 1) -> Any:
-        """Press a key on a slider; its thumb."""
+        """Press a key on a slider, once it is there to be seen (what is hidden takes no keys); its thumb."""
         thumb = self.slider(label)
-        thumb.focus()
+        thumb.wait_for()
         for _ in range(times):
             thumb.press(key)
         return thumb

@@ -3,6 +3,7 @@
 import re
 import signal
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from subprocess import PIPE, Popen
@@ -285,6 +286,19 @@ def test_nonsense_ends_in_a_sentence(app: App, capfd: pytest.CaptureFixture[str]
     assert "Traceback" not in said.out + said.err
     assert said.err.count("A page sent a message that makes no sense") == 1
     assert app.server._share_tunnel is None
+
+
+def test_what_pages_send_arrives_in_order_whatever_threads_do(app: App) -> None:
+    app.open("prototype")
+    page, bend, driver, done = page_of(app), slider(app, "Bend x [°]"), RawPage(app), threading.Event()
+    for _ in range(100):
+        app.server._thread_executor.submit(done.wait)  # those of viser are busy
+    driver.put(bend, 20.0)
+    for _ in range(9):
+        driver.key("Bend toward +x")
+    assert arrived(page, 65.0)
+    done.set()
+    driver.close()
 
 
 def test_of_many_pages_some_are_refused_in_a_sentence_and_any_other_stops(app: App) -> None:

@@ -49,11 +49,11 @@ class ControlPanel:
         self._keys()
 
     def follow(self) -> None:
-        """Show the present goals."""
-        for handle, value in self._followers:
-            now = value()
-            if handle.value != now and time.time() - handle.update_timestamp > _SETTLED:
-                handle.value = now
+        """Show the present goals, unless some that pages have sent are still to be taken."""
+        if self.session.idle:
+            for handle, value in self._followers:
+                if handle.value != (now := value()):
+                    self.server.get_event_loop().call_soon_threadsafe(_show, handle, now)
 
     def close(self) -> None:
         """Take the keys back; the tabs are removed by their owner."""
@@ -152,31 +152,30 @@ class ControlPanel:
 
     def _button(self, label: str, do: Callable[[], None]) -> None:
         def press(event: Any) -> None:
-            if not self._may(event):
-                return
-            self.session.take_over()
-            do()
-            self.session.wake()
+            if self._may(event):
+                self.session.take_over()
+                do()
 
-        self.server.gui.add_button(label, color="gray").on_click(press)
+        self.server.gui.add_button(label, color="gray").on_click(self.session.in_order(press))
 
     def _listen(self, handle: Any, put: Callable[[Any], None], *, take_over: bool = True) -> None:
         """Call `put` with what a person changes, but not with what `follow` shows. Where the page may not
         act, the handle goes back."""
         kept = handle.value
 
-        def changed(event: Any) -> None:
+        def change(event: Any, value: Any) -> None:
             nonlocal kept
-            if event.client_id is None:
-                return
             if not self._may(event):
                 handle.value = next((value() for one, value in self._followers if one is handle), kept)
                 return
-            kept = event.target.value
+            kept = value
             if take_over:
                 self.session.take_over()
-            put(event.target.value)
-            self.session.wake()
+            put(value)
+
+        async def changed(event: Any) -> None:
+            if event.client_id is not None:
+                self.session.submit(partial(change, event, event.target.value))
 
         handle.on_update(changed)
 
@@ -199,7 +198,9 @@ class ControlPanel:
             self._key(f"Keys bend segment {k + 1}", str(k + 1), partial(setattr, self, "chosen", k))
 
     def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
-        self._command(label, key).on_trigger(lambda event: do() if self._may(event) else None)
+        self._command(label, key).on_trigger(
+            self.session.in_order(lambda event: do() if self._may(event) else None)
+        )
 
     def _command(self, label: str, key: Any) -> Any:
         command = self.server.gui.add_command(label, hotkey=key)
@@ -218,7 +219,12 @@ class ControlPanel:
         bends = list(self.teleop.bent(self.chosen))
         bends[axis] += sign * _KEY_STEP
         self.teleop.bend(self.chosen, *bends)
-        self.session.wake()
+
+
+def _show(handle: Any, value: Any) -> None:
+    """In viser's loop: nothing that a page sends comes between the look and the change."""
+    if time.time() - handle.update_timestamp > _SETTLED:
+        handle.value = value
 
 
 def stops(session: Session) -> Callable[[Any], Any]:

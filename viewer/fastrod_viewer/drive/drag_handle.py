@@ -49,7 +49,7 @@ class DragHandle:
         self._hint: Any = server.scene.add_label(
             "/drag_handle/hint", "" if session.scripted else _HINT, position=(0.0, 0.0, 2.2 * radius)
         )
-        self._ball.on_drag("left")(self._dragged)
+        self._ball.on_drag("left")(session.in_order(self._drag))
 
     def follow(self, tip: Floats) -> None:
         """Move to the tip (3,) as it is drawn [m], or to the drag point."""
@@ -68,7 +68,7 @@ class DragHandle:
         """Take the ball away."""
         self._ball.remove()
 
-    def _dragged(self, event: Any) -> None:
+    def _drag(self, event: Any) -> None:
         session = self.session
         if event.phase == "end":
             self.lost(event.client_id)
@@ -81,4 +81,3 @@ class DragHandle:
             self._held_by = event.client_id
             session.take_over()
             session.teleop.drag(np.array(event.end_position) - self._place)
-        session.wake()

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ RATE = 30.0
 """Pictures a second."""
 _BEHIND = 0.25  # s: a world that falls farther behind runs slower than real time
 _BUSY = 0.8  # of a picture's time: what steps of rods in motion take at most, so that it moves evenly
-_REST = 12  # pictures after the last motion, in which an observer comes to rest
+_REST = 12  # steps after the last motion, in which an observer comes to rest
 _SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when commands come quickly
 _SPREAD = 1.25  # of a step, over which a robot spreads it: the next one may come late
@@ -90,7 +90,7 @@ class Session:
         self._moved = time.perf_counter()
         self._steps = 0
         self._since: float | None = None
-        self._woken = 0.0
+        self._rested = _REST
         self._command: ManualCommand | None = None
         self._problem, self._said = "", 0.0
         self._recorded, self._restarts = -np.inf, 0
@@ -171,7 +171,6 @@ class Session:
         """Answer at once: a control was moved."""
         if self._since is None:
             self._since = time.perf_counter()
-        self._woken = time.perf_counter()
         self._wake.set()
 
     def take_over(self) -> None:
@@ -182,6 +181,20 @@ class Session:
         """Do something between two steps, in the session's thread."""
         self._jobs.put(job)
         self.wake()
+
+    def in_order(self, job: Callable[[Any], None]) -> Callable[[Any], Any]:
+        """Return what viser calls with each event in its own loop, to do `job` in the order of the events:
+        its threads would do them in any."""
+
+        async def heard(event: Any) -> None:
+            self.submit(lambda: job(event))
+
+        return heard
+
+    @property
+    def idle(self) -> bool:
+        """Nothing that was submitted waits."""
+        return self._jobs.empty()
 
     def stop(self) -> None:
         """Stop everything at once; commands wait for `release`. While stopped it is a stop again, and ends a
@@ -276,6 +289,8 @@ class Session:
                 self._wake.clear()
                 since, self._since = self._since, None
                 did = self._do_jobs()
+                if since is not None:
+                    self._rested = 0
                 moves = self._moves()
                 due = (
                     self._advance(max(due, began - self._latest()), began, at_once=since is not None)
@@ -324,7 +339,7 @@ class Session:
             or (self.world.ringing is not None and not self.world.ringing.rests)
         ):
             return True
-        return not self.teleop.arrived or time.perf_counter() - self._woken < _REST / RATE
+        return not self.teleop.arrived or self._rested < _REST
 
     def _latest(self) -> float:
         """Return how late a step may be to be made up for [s]."""
@@ -357,10 +372,12 @@ class Session:
     def _try(self, dt: float) -> bool:
         """Do one step; return whether it could be done. Otherwise the problem is kept, and the goals are as
         before."""
+        self._rested = self._rested + 1 if self.teleop.arrived else 0
         try:
             self._one(dt)
         except FastrodError as error:
             self._problem, self._said = str(error), time.perf_counter()
+            self._rested = _REST
             if not self._scripted:
                 self.teleop.retreat()
             return False

@@ -238,7 +238,7 @@ class ReplayPage(ViewerPage):
         ]
         return facts(rows)
 
-    def _scrub(self, event: Any) -> None:
+    async def _scrub(self, event: Any) -> None:  # in viser's loop, before the clock moves the slider again
         if event.client_id is not None:
             self._scrubbed, self._playing, self._time = time.perf_counter(), False, float(event.target.value)
             self._wake.set()
