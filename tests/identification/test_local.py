@@ -51,11 +51,13 @@ def samples() -> LogSamples:
 class Place:
     """A reference, and everything at it."""
 
-    def __init__(self, *effects: str) -> None:
+    def __init__(self, *effects: str, size: float = 0.0) -> None:
+        """With effects of a `size`, in their scales."""
         self.model = base_model(robot())
         for name in effects:
             self.model = self.model.with_effect(name)
-        self.theta = self.model.start
+        sizes = [size * u.scale * (u.place[0] == "effect" and not u.shape) for u in self.model.unknowns]
+        self.theta = self.model.start + sizes
         self.samples = samples()
         self.rod = PredictedRod(self.samples, self.model.robot, points=True)
         self.target = target_of(self.samples, SIGMA, rotation_sigma=0.01, points=True)
@@ -91,14 +93,9 @@ def test_at_the_reference_it_is_the_model(place: Any) -> None:
 
 
 def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.ndarray:
-    """Central difference of exact predictions, over a step that is ten times smaller than the local one's."""
-    unknown = model.unknowns[j]
-    step = 0.01 if unknown.log else 0.01 * unknown.scale
-    ends = []
-    for sign in (1.0, -1.0):
-        moved = theta.copy()
-        moved[j] += sign * step
-        ends.append(here.exact(model, moved))
+    """Central difference of exact predictions, over a fifth of the local one's step."""
+    step = 0.01 if model.unknowns[j].log else 0.01 * model.unknowns[j].scale
+    ends = [here.exact(model, theta + side * step * np.eye(len(theta))[j]) for side in (1.0, -1.0)]
     return (ends[1] - ends[0]) / (2.0 * step)
 
 
@@ -119,10 +116,9 @@ FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
 # any phase;
 MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006}
 MEMORY |= {"second_order_lag": 0.15}
-# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
-# that. Tendons that stretch by thirty times their compliance here do so by a third.
-ROD = {"gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03}
-ROD |= {"precurvature": 0.02, "stiffness_taper": 0.05, "stiffness_anisotropy": 0.2}
+# and what changes the rod by a one-sided difference of a twentieth of a typical size.
+RODS = "gravity tendon_stretch routing_angle axial_compression precurvature stiffness_taper"
+ROD = dict.fromkeys([*RODS.split(), "stiffness_anisotropy"], 0.015)
 NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
 
 
@@ -165,8 +161,8 @@ def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
 
 
 def test_slopes_of_the_base_parameters() -> None:
-    """Stiffness by a one-sided difference of 5 %, lengths of two."""
-    here, own = base(), {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01}
+    """By one-sided differences of a twentieth of their scale."""
+    here, own = base(), {"bending_stiffness": 0.004, "torsional_stiffness": 0.004, "length": 0.01}
     assert_slopes(here, here.model, here.theta, 0, own | TENDONS | CAMERA)
 
 
@@ -181,13 +177,14 @@ def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROD)
-def test_slopes_of_effects_that_need_the_rod(name: str) -> None:
-    assert_slopes(*near_neutral(name), ROD)
+def test_slopes_of_effects_that_the_reference_has(name: str) -> None:
+    here = Place(name, size=1.0)
+    assert_slopes(here, here.model, here.theta, len(base().theta), ROD)
 
 
 @pytest.mark.parametrize("name", ROD)
 def test_one_effect_on_the_rod_is_exact_at_its_typical_size(name: str) -> None:
-    """The secant's other end, one parameter at a time."""
+    """Of a candidate slopes are secants over that: their other end, one parameter at a time."""
     here = base()
     first = len(here.theta)
     model = here.model.with_effect(name)
