@@ -184,6 +184,9 @@ def test_explained_is_about_the_noise_and_not_about_the_error_before(at_floor: b
     """1 % of a large error may be twice the noise, and a tenth of a small one within it."""
     for left in (0.01, 0.1):
         assert found(left, at_floor=at_floor).verdict == verdict
+    # of a noise that is hardly known, what has no structure may be all
+    loose = [found(left, at_floor=at_floor, like_noise=True).verdict for left in (0.01, 0.1)]
+    assert loose == ["explained", verdict]
     # a pattern that takes more than little is something, however near the noise the rest is
     pattern = grounds(
         library=0.7, after=0.6, steps=[took(None), took(JUMP)], found=["backlash"], at_floor=at_floor

@@ -18,7 +18,7 @@ from fastrod.identification.log.split import SplitLog, thinned
 from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, known_model, nominal_of
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.signature import signatures
-from fastrod.identification.report.verdict import AT_A_PRICE, CLEAN, VerdictGrounds, choose_verdict, strained
+from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.report.wording import amount, plain_name, words
 from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
 from fastrod.identification.search.model_selection import (
@@ -152,7 +152,6 @@ def verdict_on(
         s.taken.name: s.taken for s in reversed(outcome.steps) if s.taken and s.taken.name in explained.names
     }
     classes, (held_out, n_held_out) = _classes(outcome.steps, explained.names), _held_out(explained)
-    near, most = _NEAR * floor, max(_NEAR * floor, base.noise.most(n_held_out))
     return choose_verdict(
         base=_square(given.start),
         library=library,
@@ -166,9 +165,8 @@ def verdict_on(
             *(_spoken(name, explained.state.model, classes) for name in explained.names),
         ],
         held_out=(error.before, error.after),
-        # few rests know it only roughly
-        at_floor=held_out <= (most if remaining.structured <= CLEAN else near),
-        like_noise=held_out <= most,
+        at_floor=held_out <= _NEAR * floor,
+        like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
         evident=error.after < _FALLS * error.before
         and all(one.z > Z_ACCEPT and one.bic_gain > BIC_STRONG for one in named.values()),
     )

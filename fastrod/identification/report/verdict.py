@@ -63,9 +63,9 @@ def choose_verdict(
     `library` effects found,
     `after` those and alternative patterns, and the noise `floor`; `left_out`: share of the held-out error
     above the noise that is left; `held_out`: that error before and after, rms [m]; `at_floor`: whether it is
-    the noise's (without it: by the share that is left); `like_noise`: whether so few samples of slow noise
-    may be as large; `evident`: whether each effect is so beyond doubt that it is named beside much that is
-    left."""
+    the noise's (without it: by the share that is left); `like_noise`: whether noise that is no better known,
+    on so few samples, may be as large; `evident`: whether each effect is so beyond doubt that it is named
+    beside much that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     alternatives = [
         step.taken.alternative
@@ -108,7 +108,8 @@ def choose_verdict(
         )
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
     below = held_out[1] <= _AT * float(np.sqrt(floor))  # a pattern of the fit is none where nothing is left
-    done = left <= _EXPLAINED if at_floor is None else at_floor and (foreign <= _EXPLAINED or below)
+    near = at_floor or (like_noise and structure.structured <= CLEAN)
+    done = left <= _EXPLAINED if at_floor is None else near and (foreign <= _EXPLAINED or below)
     if done:
         said = f"{_cut(found, held_out, base, library, floor)}."
         # at the noise no pattern is named
