@@ -49,6 +49,7 @@ from fastrod.identification.search.model_selection import (
     z_between,
 )
 from fastrod.identification.search.solve import (
+    BEYOND,
     Fit,
     bic,
     effective_size,
@@ -557,11 +558,35 @@ class Search:
         return replace(more, candidates=every)
 
     def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
-        tried = []
+        tried, nominal = [], self._nominal(state)
         for name in names:
             self.report(name)
-            tried.append(self.candidate(state, name))
+            one = self.candidate(state, name)
+            if nominal is not None and not self.spent:
+                other = self._anew(state, nominal, name)
+                one = other if other.passes and _distinct(other, one) else one
+            tried.append(one)
         return tried
+
+    def _nominal(self, state: ModelState) -> LinearisedModel | None:
+        """The model at the robot that its file says, where a fit has drawn a number far from there: that may
+        stand in for the effect that is missing, and no slope leads back. A rod of modes or in motion has no
+        time for it."""
+        mean, sd = state.model.prior
+        own = np.array([u.place[0] != "effect" for u in state.model.unknowns], bool)
+        if self.in_motion or self.rod.of_modes or not (np.abs(state.theta - mean) > BEYOND * sd)[own].any():
+            return None
+        return self._near(state.model, np.where(own, mean, state.theta))
+
+    def _anew(self, state: ModelState, nominal: LinearisedModel, name: str) -> Candidate:
+        """An effect fitted beside a state from another place, the model `nominal`."""
+        model = state.model.with_effect(name)
+        amplitudes, found, n = state.fit.theta[len(state.theta) :], state.alternatives, len(state.theta)
+        starts = [np.concatenate([nominal.theta, at[n:]]) for at in starts_of(state, model, name)[:3]]
+        fits = [self._fit(nominal, model, at, amplitudes, found, _FEW) for at in starts]
+        best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
+        fit = self._fit(nominal, model, best, amplitudes, found, _MANY)
+        return self.judged(state, self._state(model, nominal, fit, found), name)
 
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
@@ -845,7 +870,8 @@ def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
 
 
 def _distinct(one: Candidate, other: Candidate) -> bool:
-    """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law."""
+    """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law, or
+    at these numbers."""
     return other.state is None or _clearly_better(one, other)
 
 
