@@ -38,9 +38,7 @@ ANGLE = 0.01
 _BEND = 2e-3  # rad, step of the slopes by bend
 _BALANCE = 3  # Newton steps; a force that is linear in the tip takes one
 _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
-_STEP = (
-    0.05  # of an unknown's scale, of slopes at the reference: over a whole one they were off by up to 26 %
-)
+_STEP = 0.05  # of an unknown's scale, of slopes at the reference: by a whole one they were 26 % off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
