@@ -675,9 +675,11 @@ class Search:
         """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
         drive, alike = found.model.drive_of(name), found.model.alike(name)
         model = state.model.with_effect(name, drive=drive, alike=alike)
-        theta = np.concatenate([state.theta, found.from_here(model)[len(state.theta) :]])
-        fit = self._fit(state.linearised, model, theta, np.zeros(0), (), _MANY)
-        return self._state(model, state.linearised, fit, ())
+        there, n = found.from_here(model), len(state.theta)
+        # with what else is there the robot's own numbers may have gone far
+        starts = np.concatenate([state.theta, there[n:]]), there
+        fits = [self._fit(state.linearised, model, at, np.zeros(0), (), _MANY) for at in starts]
+        return self._state(model, state.linearised, min(fits, key=lambda fit: fit.loss), ())
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its alternative patterns, fitted again: what the library alone explains."""
