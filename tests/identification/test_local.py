@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,7 @@ class Place:
 
     def __init__(self, *effects: str, size: float = 0.0) -> None:
         """With effects of a `size`, in their scales."""
-        self.model = base_model(robot())
-        for name in effects:
-            self.model = self.model.with_effect(name)
+        self.model = reduce(Model.with_effect, effects, base_model(robot()))
         sizes = [size * u.scale * (u.place[0] == "effect" and not u.shape) for u in self.model.unknowns]
         self.theta = self.model.start + sizes
         self.samples = samples()

@@ -291,8 +291,7 @@ def test_nonsense_ends_in_a_sentence(app: App, capfd: pytest.CaptureFixture[str]
 def test_what_pages_send_arrives_in_order_whatever_threads_do(app: App) -> None:
     app.open("prototype")
     page, bend, driver, done = page_of(app), slider(app, "Bend x [°]"), RawPage(app), threading.Event()
-    for _ in range(100):
-        app.server._thread_executor.submit(done.wait)  # those of viser are busy
+    [app.server._thread_executor.submit(done.wait) for _ in range(100)]  # those of viser are busy
     driver.put(bend, 20.0)
     for _ in range(9):
         driver.key("Bend toward +x")
@@ -447,8 +446,11 @@ def test_a_page_that_closes_in_motion_leaves_no_motion_behind(app: App, watched:
     driver.put(speed, 5)  # slow, so that it is still on its way
     driver.put(bend, 85.0)
     assert until(lambda: bool(link.read().dl.min() < -1e-5))
+    page.session.submit(lambda: threading.Event().wait(1.0) and None)  # what comes now waits
+    driver.put(slider(app, "Bend y [°]"), 40.0)
     driver.close()
-    assert until(lambda: page.teleop.arrived)  # what it was sent to is given up
+    assert until(lambda: page.session.idle and page.teleop.arrived)  # what it was sent to is given up
+    assert page.teleop.bent(0)[1] == pytest.approx(0.0, abs=1e-3)
     assert link.read().dl.min() > -0.0075 * np.radians(80.0)
     assert until(lambda: link.stopped != watched)
     if watcher is not None:

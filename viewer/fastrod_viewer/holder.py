@@ -151,9 +151,9 @@ class HolderPanels:
         self._noted: dict[int, float] = {}
 
     def may(self, event: Any) -> bool:
-        """Return whether the page that an event of viser comes from may act now; a page that may not reads
-        why."""
-        if self.holder.acts(event.client_id):
+        """Return whether the page that an event of viser comes from may act now: it is still there, and has
+        the controls. A page that may not reads why."""
+        if event.client_id in (None, *self.server.get_clients()) and self.holder.acts(event.client_id):
             return True
         now = time.monotonic()
         if now - self._noted.get(event.client_id, -_QUIET) >= _QUIET:

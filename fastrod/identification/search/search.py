@@ -672,11 +672,11 @@ class Search:
         return state.fit.residual.size * float(np.mean((self.noise / sigma) ** 2))
 
     def beside(self, state: ModelState, name: str, found: ModelState) -> ModelState:
-        """`state` with an effect of the state `found`, fitted from the numbers that it has there."""
+        """`state` with an effect of the state `found`, fitted from the numbers that it has there, beside the
+        robot's of either."""
         drive, alike = found.model.drive_of(name), found.model.alike(name)
         model = state.model.with_effect(name, drive=drive, alike=alike)
         there, n = found.from_here(model), len(state.theta)
-        # with what else is there the robot's own numbers may have gone far
         starts = np.concatenate([state.theta, there[n:]]), there
         fits = [self._fit(state.linearised, model, at, np.zeros(0), (), _MANY) for at in starts]
         return self._state(model, state.linearised, min(fits, key=lambda fit: fit.loss), ())
