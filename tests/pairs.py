@@ -25,27 +25,23 @@ def heavy(mass: float, name: str = "prototype") -> Robot:
 
 
 class FreeBody:
-    """A ball whose centre is the base, stepped the way that rigid-body engines do."""
+    """A body whose centre is the base, stepped the way that rigid-body engines do; its radius of gyration is
+    `radius` of the rod's length."""
 
-    def __init__(self, robot: Robot, ratio: float, dt: float, spin: tuple[float, float, float]) -> None:
+    def __init__(
+        self, robot: Robot, ratio: float, dt: float, spin: tuple[float, float, float], radius: float = 0.5
+    ) -> None:
         self.rod, self.dt = Rod(robot, dt=dt, dynamics=True, points_per_segment=20), dt
         self.mass = ratio * sum(s.line_density * s.length for s in robot.segments)
-        self.inertia = self.mass * (0.5 * robot.length) ** 2
+        self.inertia = self.mass * (radius * robot.length) ** 2
         self.pose, self.twist = HOME.copy(), np.array([0.0, 0.0, 0.0, *spin])
 
     def step(self, gravity: float = 0.0, **inputs: Any) -> None:
         weight = np.array([0.0, 0.0, -gravity])
         free = self.twist + self.dt * np.array([*weight, 0.0, 0.0, 0.0])
         mobility = np.diag([1.0 / self.mass] * 3 + [1.0 / self.inertia] * 3)
-        self.rod.advance(
-            self.pose,
-            self.twist,
-            self.dt,
-            inverse_inertia=mobility,
-            free_twist=free,
-            gravity=weight,
-            **inputs,
-        )
+        given = {"inverse_inertia": mobility, "free_twist": free, "gravity": weight} | inputs
+        self.rod.advance(self.pose, self.twist, self.dt, **given)
         self.twist = free + self.dt * mobility @ self.rod.wrench
         self.pose = displaced(self.pose, self.dt * self.twist)
 

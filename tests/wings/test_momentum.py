@@ -22,13 +22,16 @@ from fastrod.types import Floats
 
 
 @pytest.mark.study(beyond=4)
-@pytest.mark.parametrize(("ratio", "dt"), [(0.2, 1e-3), (0.2, 1e-2), (1.0, 5e-3), (20.0, 1e-3)])
+@pytest.mark.parametrize(
+    ("ratio", "dt", "radius"),
+    [(0.2, 1e-3, 0.5), (0.2, 1e-2, 0.5), (1.0, 5e-3, 0.5), (20.0, 1e-3, 0.5), (0.02, 1e-2, 0.05)],
+)
 @pytest.mark.parametrize("name", ["prototype", "five_segment_reacher"])
 def test_a_body_and_its_bent_rod_that_is_let_go_keep_their_momentum(
-    name: str, ratio: float, dt: float
+    name: str, ratio: float, dt: float, radius: float
 ) -> None:
     robot = heavy(0.1, name)
-    body, pull = FreeBody(robot, ratio, dt, (0.3, 0.0, 1.0)), np.zeros(len(robot.rest_tendon_length))
+    body, pull = FreeBody(robot, ratio, dt, (0.3, 0.0, 1.0), radius), np.zeros(len(robot.rest_tendon_length))
     pull[0] = 1e-3
     body.rod.settle(HOME, tendon_length=robot.rest_tendon_length - pull, gravity=(0.0, 0.0, 0.0))
     before, lost, size = np.zeros(6), [], []

@@ -130,13 +130,13 @@ def pass_of_modes(
         if stage == 0:
             begin_step(robots, motion, short, zero, work)
             base_soon(robots, motion, short, run.dt, work.base)
-            start_host(robots, batch.host, motion, short, zero, b, work)
+            start_host(robots, batch.host, motion, short, zero, work)
         elif run.kind == REST:
             start_settling(robots, motion, work)
             no_host(work)
         else:
             begin_step(robots, motion, scheme, jump, work)
-            start_host(robots, batch.host, motion, scheme, jump, b, work)
+            start_host(robots, batch.host, motion, scheme, jump, work)
         if work.piece[0, P_UNEVEN * W] > 0.0:
             curvature_counted_from(b, work)
         least, most = (run.least, max(2, run.least)) if stage == 0 else (run.least, run.most)
@@ -161,6 +161,6 @@ def pass_of_modes(
                 start_from_rest(w, robots[w], motion, run.remembers, work)
             elif run.iterations[robots[w]] > 0:
                 if read(work.host, G_ON, w) > 0.0:
-                    note_momentum(w, robots[w], batch.host, motion, scheme, jump[w], b, work)
+                    note_momentum(w, robots[w], batch.host, b, motion, work)
                 end_step(w, robots[w], motion, scheme, jump[w], work)
     show_chunk(robots, n_robots, batch, output, work)

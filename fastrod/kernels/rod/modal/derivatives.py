@@ -264,7 +264,7 @@ def write_base(
     """Six unknowns more of a base that gives way, its displacement and rotation: gradient, Hessian, and the
     motion of the point forces."""
     n_q, n_points = len(work.q) // W, out.point_change.shape[1]
-    demand_of_base(batch.basis, batch.motion, work, work.scratch)
+    demand_of_base(robots, batch.basis, batch.motion, work, work.scratch)
     for w in range(n_robots):
         i, base, on = robots[w], get(work.base, 9, w), read(work.host, G_ON, w) > 0.0
         for r in range(6):
@@ -315,9 +315,7 @@ def derivatives_of_modes(
     if run.kind == REST or run.kind == AFTER_JUMP:
         no_host(work)
     else:
-        start_host(
-            robots, batch.host, batch.motion, Scheme(run.kind, run.dt, run.rho), jump, batch.basis, work
-        )
+        start_host(robots, batch.host, batch.motion, Scheme(run.kind, run.dt, run.rho), jump, work)
     for w in range(W):
         for a in range(len(work.q) // W):
             write(work.q, a, w, unknowns[robots[w], a])

@@ -3,11 +3,11 @@
 The body's engine moves it to x_free without the rod, the semi-implicit way of rigid-body engines: velocity
 from the forces, then position from the velocity. With the rod it comes to x_free + d, and momentum says
   P d = w,   P = Lambda / dt^2,
-Lambda the body's inertia at the base point, w the mean over the step of the wrench that the rod exerts. The
-rod's scheme knows its wrench at the end of the step; the mean differs from it by that of inertia,
-  mean of a = kappa a + h,   kappa = g / (dt alpha),   h from what is remembered,
-so that rod and body exchange momentum and lose none. Divided by kappa this is one symmetric system with the
-balance of the modes; their unknowns are eliminated by the factor that is there.
+Lambda the body's inertia at the base point, w the mean over the step of the wrench that the rod exerts: what
+acts on the rod from outside, less its change of momentum, so that rod and body exchange momentum and lose
+none. Of the acceleration at the end the mean has kappa = g / (dt alpha). Divided by it this is one system
+with the balance of the modes, symmetric but for what a step leaves out; the modes are eliminated by the
+factor that is there. What Newton's method leaves moves the body by P^-1 of it: a light one needs more steps.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from .fields import (
     G_ANY,
     G_D,
     G_FREE,
-    G_HISTORY,
     G_KAPPA,
+    G_LIGHT,
     G_ON,
     G_P,
     G_PULL,
+    G_SCHEME,
     G_START,
     G_STEP,
     H_J,
@@ -50,17 +51,7 @@ from .fields import (
     hessian,
 )
 from .modes import ModalBasis
-from .motion import (
-    NODE_VECTORS,
-    ModalMotion,
-    Scheme,
-    counted_from,
-    factors,
-    moved_on,
-    n_lumps,
-    node_number,
-    scheme_of,
-)
+from .motion import ModalMotion, Scheme, factors, moved_on, n_lumps, node_number, scheme_of
 
 
 class ModalHost(NamedTuple):
@@ -94,23 +85,6 @@ def hosted(work: ModalWork) -> bool:
 
 
 @inline
-def mean_remembered(s: Scheme, x: float, v: float, x_other: float, v_other: float) -> float:
-    """h of one number: mean of its acceleration over the step = kappa a + h, a that at its end."""
-    _, g = factors(s)
-    mean = (moved_on(s, x, x, v, x_other, v_other)[1] - v) / s.dt
-    return mean - g / s.dt * (x - counted_from(s, x, v, x_other, v_other))
-
-
-@inline
-def _remembered(s: Scheme, motion: ModalMotion, i: int, m: int) -> Vec:
-    """h of three numbers."""
-    x, v, a, c = motion.place[i], motion.velocity[i], motion.place_other[i], motion.velocity_other[i]
-    h0 = mean_remembered(s, x[m], v[m], a[m], c[m])
-    h1 = mean_remembered(s, x[m + 1], v[m + 1], a[m + 1], c[m + 1])
-    return h0, h1, mean_remembered(s, x[m + 2], v[m + 2], a[m + 2], c[m + 2])
-
-
-@inline
 def _soon(s: Scheme, motion: ModalMotion, i: int, m: int) -> Vec:
     """Three numbers a step later, at their velocity."""
     return axpy(s.dt, _three(motion.velocity[i], m), _three(motion.place[i], m))
@@ -124,17 +98,10 @@ def no_host(work: ModalWork) -> None:
 
 @kernel
 def start_host(
-    robots: Ints,
-    host: ModalHost,
-    motion: ModalMotion,
-    each: Scheme,
-    jump: Lanes,
-    b: ModalBasis,
-    work: ModalWork,
+    robots: Ints, host: ModalHost, motion: ModalMotion, each: Scheme, jump: Lanes, work: ModalWork
 ) -> None:
-    """After `begin_step`: the bodies' inertia, where they would be, and the mean of the rod's inertia that is
-    known before the step."""
-    to, n_nodes = work.host, work.node.shape[1]
+    """After `begin_step`: the bodies' inertia, and where they would be."""
+    to = work.host
     clear(to)
     if len(host.inertia) == 0:
         return
@@ -146,31 +113,16 @@ def start_host(
         write(to, G_ON, w, 1.0 if on else 0.0)
         write(to, G_ANY, 0, max(read(to, G_ANY, 0), 1.0 if on else 0.0))
         write(to, G_KAPPA, w, kappa)
+        write(to, G_SCHEME, w, float(s.kind))
+        write(to, G_SCHEME + 1, w, s.dt)
+        write(to, G_SCHEME + 2, w, s.rho)
+        put(to, G_START, w, _three(motion.place[i], 0))
         for k in range(36):
             write(to, G_P + k, w, host.inertia[i, k // 6, k % 6] / (kappa * s.dt * s.dt))
         put_mat(to, G_FREE, w, get_mat(work.base, 0, w))
         put(to, G_FREE + 9, w, get(work.base, 9, w))
         if not on:
             continue
-        force, moment, m, base = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, _soon(s, motion, i, 0)
-        for p in range(work.node.shape[0]):
-            piece = work.piece[p]
-            for j in range(n_nodes):
-                mass = b.integral[n_nodes - 1, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
-                f = scale(mass, _remembered(s, motion, i, m))
-                force, moment = add(force, f), add(moment, cross(sub(_soon(s, motion, i, m), base), f))
-                for k in range(3):
-                    d = m + 3 + 3 * k
-                    spin = scale(read(work.history[p, j], H_J + k, w), _remembered(s, motion, i, d))
-                    moment = add(moment, cross(_soon(s, motion, i, d), spin))
-                m += NODE_VECTORS
-        for p in range(work.station.shape[0]):
-            for k in range(n_lumps(motion, work)):
-                f = scale(read(work.station[p, k], S_MASS, w), _remembered(s, motion, i, m))
-                force, moment = add(force, f), add(moment, cross(sub(_soon(s, motion, i, m), base), f))
-                m += 3
-        put(to, G_HISTORY, w, force)
-        put(to, G_HISTORY + 3, w, moment)
         start_near(w, i, s, motion, work)
 
 
@@ -262,19 +214,75 @@ def rigid_stiffness(work: ModalWork, r: int, c: int, w: int) -> float:
     return 0.5 * (one + other)
 
 
+@inline
+def _from_outside(w: int, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> tuple[Vec, Vec]:
+    """Force and moment, about where the base point was, that act on the rod at the end of the step: what its
+    inertia needs, less what the base gives it."""
+    force, moment = inertia_about_base(w, b, motion, work)
+    force = sub(force, get(work.beyond[0], B_F, w))
+    moment = sub(moment, get(work.beyond[0], B_M, w))
+    arm = sub(get(work.base, 9, w), get(work.host, G_START, w))
+    return force, add(moment, cross(arm, force))
+
+
+@inline
+def _gained(w: int, i: int, b: ModalBasis, motion: ModalMotion, work: ModalWork) -> tuple[Vec, Vec]:
+    """Change of momentum of robot i over the step, over dt, about where the base point was."""
+    start = get(work.host, G_START, w)
+    n, m, force, moment = b.width.shape[0], 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for p in range(work.node.shape[0]):
+        piece = work.piece[p]
+        for j in range(n + 1):
+            node, mass = work.node[p, j], b.integral[n, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
+            for k in range(4):
+                new = (
+                    node_number(node, 3 * k, w),
+                    node_number(node, 3 * k + 1, w),
+                    node_number(node, 3 * k + 2, w),
+                )
+                weight = mass if k == 0 else read(work.history[p, j], H_J + k - 1, w)
+                f, turning = _momentum(w, motion, i, m, new, start if k == 0 else (0.0, 0.0, 0.0), work)
+                force = axpy(weight, f, force) if k == 0 else force
+                moment = axpy(weight, turning, moment)
+                m += 3
+    for p in range(work.station.shape[0]):
+        for k in range(n_lumps(motion, work)):
+            weight = read(work.station[p, k], S_MASS, w)
+            f, turning = _momentum(w, motion, i, m, get(work.station[p, k], S_POS, w), start, work)
+            force, moment = axpy(weight, f, force), axpy(weight, turning, moment)
+            m += 3
+    return force, moment
+
+
+@inline
+def _momentum(
+    w: int, motion: ModalMotion, i: int, m: int, new: Vec, about: Vec, work: ModalWork
+) -> tuple[Vec, Vec]:
+    """Change over the step of the velocity of three numbers, and of its moment, over dt."""
+    to = work.host
+    s = Scheme(int(read(to, G_SCHEME, w)), read(to, G_SCHEME + 1, w), read(to, G_SCHEME + 2, w))
+    x, v, a, c = motion.place[i], motion.velocity[i], motion.place_other[i], motion.velocity_other[i]
+    v0 = moved_on(s, new[0], x[m], v[m], a[m], c[m])[1]
+    v1 = moved_on(s, new[1], x[m + 1], v[m + 1], a[m + 1], c[m + 1])[1]
+    after = (v0, v1, moved_on(s, new[2], x[m + 2], v[m + 2], a[m + 2], c[m + 2])[1])
+    before = _three(v, m)
+    turning = sub(cross(sub(new, about), after), cross(sub(_three(x, m), about), before))
+    return scale(1.0 / s.dt, sub(after, before)), scale(1.0 / s.dt, turning)
+
+
 @kernel
-def demand_of_base(b: ModalBasis, motion: ModalMotion, work: ModalWork, right: Lanes) -> None:
-    """Derivative of the energy by displacement and rotation of the bases, into `right` (6,), and G_PULL."""
+def demand_of_base(robots: Ints, b: ModalBasis, motion: ModalMotion, work: ModalWork, right: Lanes) -> None:
+    """Derivative of the energy by displacement and rotation of the bases, into `right` (6,), and G_PULL: zero
+    where P d = w."""
     to = work.host
     for w in range(W):
-        inertia, turning = inertia_about_base(w, b, motion, work)
-        kappa = read(to, G_KAPPA, w)
+        force, moment = _from_outside(w, b, motion, work)
+        lost, turned = _gained(w, robots[w], b, motion, work)
+        force, moment = sub(force, lost), sub(moment, turned)
         for k in range(6):
-            needed = read(work.beyond[0], B_F + k, w)
-            mean = inertia[k] if k < 3 else turning[k - 3]
-            pull = (1.0 - kappa) * mean - read(to, G_HISTORY + k, w) - needed if kappa > 0.0 else 0.0
-            write(to, G_PULL + k, w, -pull / kappa - needed if kappa > 0.0 else 0.0)
-            write(right, k, w, needed + read(to, G_PULL + k, w))
+            needed, mean = read(work.beyond[0], B_F + k, w), force[k] if k < 3 else moment[k - 3]
+            write(to, G_PULL + k, w, -mean / read(to, G_KAPPA, w) - needed)
+            write(right, k, w, -mean / read(to, G_KAPPA, w))
     for r in range(6):
         for c in range(6):
             for w in range(W):
@@ -290,7 +298,9 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
     matrix, right = LaneMatrix(work.host_matrix, 6), work.scratch
     for k in range(6):
         forward(hessian(work), work.host_change[k * n_q * W : (k + 1) * n_q * W])
-    demand_of_base(b, motion, work, right)
+    demand_of_base(robots, b, motion, work, right)
+    for w in range(W):
+        write(to, G_LIGHT, w, 1.0)
     for r in range(6):
         for c in range(r + 1):
             for w in range(W):
@@ -306,7 +316,10 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
                 stiffness = at(matrix, r, c, w)
                 if read(to, G_ON, w) > 0.0:
                     host.stiffness[robots[w], r, c] = host.stiffness[robots[w], c, r] = stiffness
-                write_at(matrix, r, c, w, stiffness + read(to, G_P + 6 * r + c, w))
+                spring = read(to, G_P + 6 * r + c, w)
+                write_at(matrix, r, c, w, stiffness + spring)
+                if r == c and read(to, G_ON, w) > 0.0:
+                    write(to, G_LIGHT, w, max(read(to, G_LIGHT, w), abs(stiffness / spring)))
         for a in range(n_q):
             for w in range(W):
                 less = read(work.host_change, r * n_q + a, w) * read(work.gradient, a, w)
@@ -351,73 +364,27 @@ def add_energy_of_base(work: ModalWork, energy: Lanes) -> None:
 
 @kernel
 def note_momentum(
-    w: int,
-    i: int,
-    host: ModalHost,
-    motion: ModalMotion,
-    each: Scheme,
-    jump: float,
-    b: ModalBasis,
-    work: ModalWork,
+    w: int, i: int, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork
 ) -> None:
     """Before `end_step`: where the body of robot i has come to, and what of its mean wrench is the rod's
-    change of momentum, about where the base point was."""
-    s, n, m = scheme_of(each, jump), b.width.shape[0], 0
-    base, force, moment = _three(motion.place[i], 0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    for p in range(work.node.shape[0]):
-        piece = work.piece[p]
-        for j in range(n + 1):
-            node, mass = work.node[p, j], b.integral[n, j] * read(piece, P_L, w) * read(piece, P_RHO, w)
-            for k in range(4):
-                new = (
-                    node_number(node, 3 * k, w),
-                    node_number(node, 3 * k + 1, w),
-                    node_number(node, 3 * k + 2, w),
-                )
-                weight = mass if k == 0 else read(work.history[p, j], H_J + k - 1, w)
-                f, turning = _momentum(s, motion, i, m, new, base if k == 0 else (0.0, 0.0, 0.0))
-                force = axpy(-weight, f, force) if k == 0 else force
-                moment = axpy(-weight, turning, moment)
-                m += 3
-    for p in range(work.station.shape[0]):
-        for k in range(n_lumps(motion, work)):
-            weight = read(work.station[p, k], S_MASS, w)
-            f, turning = _momentum(s, motion, i, m, get(work.station[p, k], S_POS, w), base)
-            force, moment = axpy(-weight, f, force), axpy(-weight, turning, moment)
-            m += 3
-    put(work.host, G_START, w, base)
-    scatter(host.wrench[i, :3], force)
-    scatter(host.wrench[i, 3:], moment)
+    change of momentum."""
+    force, moment = _gained(w, i, b, motion, work)
+    scatter(host.wrench[i, :3], scale(-1.0, force))
+    scatter(host.wrench[i, 3:], scale(-1.0, moment))
     for k in range(6):
         host.moved[i, k] = read(work.host, G_D + k, w)
-
-
-@inline
-def _momentum(s: Scheme, motion: ModalMotion, i: int, m: int, new: Vec, about: Vec) -> tuple[Vec, Vec]:
-    """Change over the step of the velocity of three numbers, and of its moment, over dt."""
-    x, v, a, c = motion.place[i], motion.velocity[i], motion.place_other[i], motion.velocity_other[i]
-    v0 = moved_on(s, new[0], x[m], v[m], a[m], c[m])[1]
-    v1 = moved_on(s, new[1], x[m + 1], v[m + 1], a[m + 1], c[m + 1])[1]
-    after = (v0, v1, moved_on(s, new[2], x[m + 2], v[m + 2], a[m + 2], c[m + 2])[1])
-    before = _three(v, m)
-    turning = sub(cross(sub(new, about), after), cross(sub(_three(x, m), about), before))
-    return scale(1.0 / s.dt, sub(after, before)), scale(1.0 / s.dt, turning)
 
 
 @kernel
 def show_exchange(
     robots: Ints, n_robots: int, host: ModalHost, b: ModalBasis, motion: ModalMotion, work: ModalWork
 ) -> None:
-    """Add to the mean wrench what acts on the rod from outside: inertia at the end of the step, less what the
-    base gave it there. To be called with the balance of the last shape in `work.beyond`."""
+    """Add to the mean wrench what acts on the rod from outside. To be called with the balance of the last
+    shape in `work.beyond`."""
     for w in range(n_robots):
-        i = robots[w]
         if read(work.host, G_ON, w) <= 0.0:
             continue
-        force, moment = inertia_about_base(w, b, motion, work)
-        force = sub(force, get(work.beyond[0], B_F, w))
-        moment = sub(moment, get(work.beyond[0], B_M, w))
-        moment = add(moment, cross(sub(get(work.base, 9, w), get(work.host, G_START, w)), force))
+        force, moment = _from_outside(w, b, motion, work)
         for k in range(3):
-            host.wrench[i, k] += force[k]
-            host.wrench[i, 3 + k] += moment[k]
+            host.wrench[robots[w], k] += force[k]
+            host.wrench[robots[w], 3 + k] += moment[k]

@@ -17,6 +17,7 @@ from .cholesky import backward, factor, forward
 from .energy import energy_of_shape
 from .fields import (
     G_D,
+    G_LIGHT,
     G_ON,
     G_STEP,
     L_AGAIN,
@@ -106,7 +107,8 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
             write(newton, L_REPLACED, w, 1.0)
         replaced = read(newton, L_REPLACED, w) > 0.0
         write(newton, L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
-        every = every and (done or (size < tolerance and not replaced and read(newton, L_SIGMA, w) == 0.0))
+        small = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
+        every = every and (done or (small and not replaced and read(newton, L_SIGMA, w) == 0.0))
     return every
 
 
@@ -195,7 +197,8 @@ def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> in
         write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
         put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
         write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0)
-        if enough and sigma == 0.0 and size < tolerance and read(newton, L_AGAIN, w) == 0.0:
+        close = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
+        if enough and sigma == 0.0 and close and read(newton, L_AGAIN, w) == 0.0:
             write(newton, L_DONE, w, 1.0)
         else:
             left += 1
