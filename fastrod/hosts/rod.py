@@ -261,20 +261,23 @@ class Rod:
         self, motion: Motion, given: Given, around: Given, time_step: float, n: int, freedom: Freedom | None
     ) -> State:
         wrench, free = self._wrench, motion if freedom is None else motion._replace(velocity=freedom.twist)
+        # of what the base gains a rod at rest has what gravity gives both: others move what bears it, too
+        pull = time_step * np.array(given.get("gravity", self.robot.gravity), float)
+        falls = ((free.velocity - motion.velocity)[:, :3] * pull).sum(1, keepdims=True)
+        falls = pull * np.clip(falls / max((pull**2).sum(-1).max(), 1e-30), 0.0, 1.0)
         if self._state is None or self._fresh.any():
             begins = given
             if self.simulator.dynamics:  # at rest on its base, which may fall
-                gravity = np.array(given.get("gravity", self.robot.gravity), float)
-                gained = (free.velocity - motion.velocity)[:, :3] / time_step
-                begins = given | {"gravity": gravity - (gained if self.n_robots else gained[0])}
+                weight = (pull - falls) / time_step
+                begins = given | {"gravity": weight if self.n_robots else weight[0]}
             settle = self._settled if self._state is None else self._settled_again
             settle(motion.pose, begins, around)
         self.simulator.dt = h = time_step / n
         if self._still.any():
             if self.simulator.dynamics:
-                # an engine's velocity is that of the middle of its last step
-                middle = 0.5 * (motion.velocity + free.velocity)
-                self.simulator.set_in_motion(np.broadcast_to(middle, wrench.shape), self._still)
+                middle = np.array(np.broadcast_to(motion.velocity, wrench.shape))
+                middle[:, :3] += 0.5 * falls  # an engine's velocity is that of the middle of its last step
+                self.simulator.set_in_motion(middle, self._still)
             self._still[:] = False
         mobility = None if freedom is None or not self.simulator.dynamics else freedom.inverse_inertia
         for k in range(n):

@@ -30,15 +30,14 @@ class Hand:
     """A free box that carries rods in PyBullet or in MuJoCo."""
 
     def __init__(self, engine, n, mass, dt):
-        self.dt, self.mass, half = dt, mass, [0.03] * 3
+        self.engine, self.dt, self.mass, half = engine, dt, mass, [0.03] * 3
         inertia = [6e-4 * mass] * 3
         if engine == "pybullet":
             self.world = world = empty_world(dt)
             self.body = world.createMultiBody(mass, world.createCollisionShape(3, halfExtents=half))
             still = {"linearDamping": 0.0, "angularDamping": 0.0}
             world.changeDynamics(self.body, -1, localInertiaDiagonal=inertia, **still)
-            links = (BulletLink(world, self.body, quaternion=q) for q in around(n))
-            self.rods = [MountedRod(ROD, link) for link in links]
+            self.rods = [MountedRod(ROD, BulletLink(world, self.body, quaternion=q)) for q in around(n)]
         else:
             spec = mujoco.MjSpec()
             spec.option.timestep, spec.option.gravity = dt, [0.0] * 3
@@ -51,7 +50,6 @@ class Hand:
             self.data = mujoco.MjData(self.model)
             on = (self.model, self.data, "hand")
             self.rods = [MujocoRod(ROD, *on, quaternion=q, name=f"rod {k}") for k, q in enumerate(around(n))]
-        self.engine = engine
         for rod in self.rods:
             rod.settle()
         if engine == "pybullet":
@@ -148,6 +146,19 @@ def test_a_rod_may_settle_again_after_it_has_begun():
     assert other.begin().ok[0]
 
 
+def test_rods_on_a_light_hinge_begin_at_rest():
+    hub = '<body name="hub"><joint axis="1 0 0"/><geom size=".02" mass=".005"/></body>'
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{hub}</worldbody></mujoco>")
+    for k in range(3):
+        add_capsules(spec, ROD, "hub", name=f"rod {k}")
+    on = (model := spec.compile(), mujoco.MjData(model), "hub")
+    rods = [MujocoRod(ROD, *on, quaternion=q, name=f"rod {k}") for k, q in enumerate(around(3))]
+    for rod in rods:
+        rod.begin()
+    energy = [rod.state.kinetic_energy[0] + rod.state.strain_energy[0] for rod in rods]
+    assert_allclose(energy, energy[0], rtol=0.02)
+
+
 @pytest.mark.study
 def test_the_engines_agree():
     hands = [Hand(engine, 3, 0.05, 0.005) for engine in ("pybullet", "mujoco")]
@@ -214,9 +225,7 @@ def test_what_they_grasp_adds_nothing_to_the_momentum_of_their_hand(line_density
     hand = world.createMultiBody(mass, world.createCollisionShape(3, halfExtents=[0.05, 0.02, 0.02]))
     world.changeDynamics(hand, -1, linearDamping=0.0, angularDamping=0.0)
     thing = cube(world, 0.04, held, [0.0, 0.0, -0.2], 1.0)
-    links = [
-        BulletLink(world, hand, position=(s, 0, -0.02), quaternion=(0, 1, 0, 0)) for s in (-0.045, 0.045)
-    ]
+    links = [BulletLink(world, hand, position=(s, 0, -0.02), quaternion=DOWN) for s in (-0.045, 0.045)]
     rods = [MountedRod(robot, link, contact_bodies=[thing], friction=0.8) for link in links]
     for rod in rods:
         rod.settle()
@@ -247,16 +256,11 @@ class Grasp:
         if engine == "pybullet":
             self.world = world = empty_world(dt)
             thing = cube(world, 2.0 * half, mass, [0.0, 0.0, -0.215])
-            posts = (
-                BulletLink(world, world.createMultiBody(0.0, -1, -1, [x, 0, 0]), quaternion=(0, 1, 0, 0))
-                for x in ends
-            )
-            self.rods = [MountedRod(robot, post, contact_bodies=[thing], friction=1.0) for post in posts]
-            self.step, self.place = (
-                world.stepSimulation,
-                lambda: world.getBasePositionAndOrientation(thing)[0],
-            )
-            self.fall = lambda: world.setGravity(0.0, 0.0, -9.81)
+            posts = (world.createMultiBody(0.0, -1, -1, [x, 0, 0]) for x in ends)
+            links = (BulletLink(world, post, quaternion=DOWN) for post in posts)
+            self.rods = [MountedRod(robot, link, contact_bodies=[thing], friction=1.0) for link in links]
+            self.step, self.fall = world.stepSimulation, lambda: world.setGravity(0.0, 0.0, -9.81)
+            self.place = lambda: world.getBasePositionAndOrientation(thing)[0]
             return
         spec = mujoco.MjSpec()
         spec.option.timestep, spec.option.gravity = dt, [0.0] * 3
