@@ -351,19 +351,10 @@ def test_own_file_in_grams_to_run_log(tmp_path: Path, capsys: pytest.CaptureFixt
     raw, made = tmp_path / "raw.csv", tmp_path / "arm.toml"
     np.savetxt(raw, table, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
     options = (
-        "--length 200 --tendons 4 --offset 11.4 --drive force --radius 15.4,6.4 --markers 50,100,150,190"
+        "--length 200 --tendons 4 --offset 11.4 --drive force --radius 15.4,6.4 --markers 50,100,150,190 "
+        "--marker-offset 12,10,8,7 --base hangs"
     )
-    command = [
-        "new",
-        str(made),
-        "--log",
-        str(raw),
-        *options.split(),
-        "--marker-offset",
-        "12,10,8,7",
-        "--base",
-        "hangs",
-    ]
+    command = ["new", str(made), "--log", str(raw), *options.split()]
     assert main(command) == 0
     assert main(["check", str(raw), "--robot", str(made)]) == 0
     assert " N" in capsys.readouterr().out

@@ -248,3 +248,9 @@ def test_three_commands_from_a_file_of_ones_own(
     assert "is there already" in capsys.readouterr().err
     assert main(["new", "b.toml", "--segments", "two"]) == 2
     assert "--segments is 'two'" in capsys.readouterr().err
+    assert main(["new", "c.toml", "--drum-radius", "3"]) == 2
+    assert "--drum-radius says how a log is read; give --log FILE" in capsys.readouterr().err
+    assert main(["new", "c.toml", "--radius", "10", "--youngs-modulus", "200"]) == 0
+    (segment,) = load_robot("c.toml").segments
+    bending, weight = 2e5 * np.pi / 4.0 * 0.01**4, 1070.0 * np.pi * 0.01**2
+    assert_allclose([*segment.bending_stiffness, segment.line_density], [bending, bending, weight], rtol=1e-5)

@@ -142,8 +142,14 @@ def new(
     given["markers"] = _positive(markers) if markers else []
     beside = _numbers(marker_offset)
     given["beside"] = beside * len(given["markers"]) if len(beside) == 1 else beside
-    if given["drive"] == "force":
+    said = [name for name in QUESTIONS if answers.get(name.replace("-", "_")) is not None]
+    if given["drive"] == "force" or any(question.name in said for question in _MATERIAL):
         given |= {question.name: _answer(question, answers, ask) for question in _MATERIAL}
+    if given["drive"] != "force" and len(set(given.get("radius", [0.0]))) > 1:
+        raise InputError(f"--radius is {answers['radius']!r}; only with --drive force may a body taper.")
+    of_log = [name for name in said if name in _COLUMNS or name in [question.name for question in _FILE]]
+    if log is None and (of_log or markers):
+        raise InputError(f"--{(*of_log, 'markers')[0]} says how a log is read; give --log FILE, too.")
     text = _robot_text(path.stem, given)
     if log is not None:
         text += _log_text(read_table(log), answers, given, ask)
@@ -326,28 +332,34 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
     for k in range(given["segments"]):
         offset, count = f"{1e-3 * given['offset'][k]:.6g}", given["tendons"][k]
         lines += ["", "[[segment]]", f"length = {1e-3 * given['length'][k]:.6g}"]
-        if forces:
+        if weighs := "radius" in given:
             base, tip = given["radius"][0], given["radius"][-1]
             radius = [round(1e-3 * (base + (tip - base) * float(s)), 7) for s in ends]
-            even = base == tip
-            lines += [
-                f"body_radius = {radius[k] if even else radius[k : k + 2]}",
-                f"youngs_modulus = {1e3 * given['youngs-modulus'][0]:.6g}  # Pa",
-                "poisson = 0.5",
-                f"density = {given['density'][0]:.6g}",
-                'mode = "tendon_tension"  # a log gives the force on each tendon',
-            ]
+            even, modulus, density = base == tip, 1e3 * given["youngs-modulus"][0], given["density"][0]
+            area, bending = math.pi * radius[0] ** 2, modulus * 0.25 * math.pi * radius[0] ** 4
             if not even:
                 offset = str([round(given["offset"][k] * r / base, 7) for r in radius[: k + 2]])
-        lines += (
-            []
-            if forces
-            else [
+        if forces:
+            lines += [
+                f"body_radius = {radius[k] if even else radius[k : k + 2]}",
+                f"youngs_modulus = {modulus:.6g}  # Pa",
+                "poisson = 0.5",
+                f"density = {density:.6g}",
+                'mode = "tendon_tension"  # a log gives the force on each tendon',
+            ]
+        elif weighs:
+            lines += [
+                f"bending_stiffness = [{bending:.6g}, {bending:.6g}]  # EI, N m^2, of {modulus / 1e3:g} kPa",
+                f"torsional_stiffness = {2.0 / 3.0 * bending:.6g}  # GJ, N m^2, of what keeps its volume",
+                f"body_radius = {radius[0]:.6g}",
+                f"line_density = {density * area:.6g}  # kg/m, of {density:g} kg/m^3",
+            ]
+        else:
+            lines += [
                 "bending_stiffness = [0.01, 0.01]  # EI about d1, d2, N m^2: seen where loads bend the robot",
                 "torsional_stiffness = 0.0077      # GJ, N m^2",
                 f"body_radius = {1.2 * max(given['offset'][k:]) * 1e-3:.6g}",
             ]
-        )
         if pulls:
             lines.append("axial_stiffness = 1e4             # EA, N: tendons that pull shorten the body")
         extra = ", compliance = 4e-5, pretension = 2.0" if pulls else ""
@@ -365,8 +377,9 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
             '"tendon.*.pretension" = { sd = 4.0 }',
         ]
         lines += ['"segment.*.axial_stiffness" = { sd = 1e4 }']
-    if forces:
+    if weighs:
         lines[3:3] = ["", "[base]", f"quaternion = {_BASES[given['base']]}  # world_from_base, w x y z"]
+    if forces:
         lines += ['"material.youngs_modulus" = { sd = 0.5 }', '"material.density" = { sd = 0.1 }']
         lines += ['"material.taper" = { sd = 0.1 }']
     lines += [
