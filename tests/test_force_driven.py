@@ -362,6 +362,8 @@ def test_own_file_in_grams_to_run_log(tmp_path: Path, capsys: pytest.CaptureFixt
     back = read_log(tmp_path / "run.csv", made)
     assert_allclose(back.tension, log.tension, atol=1e-8)
     assert_allclose(back.tip_position, log.tip_position, atol=1e-9)
+    assert main(["drive", "track", "--emulate", "--robot", str(made)]) == 2
+    assert "driven by forces" in capsys.readouterr().err
 
 
 def test_unit_of_length_for_forces_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

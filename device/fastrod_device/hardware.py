@@ -50,6 +50,11 @@ class Hardware:
 
     def __post_init__(self) -> None:
         nodes = [spec.node for spec in self.drives]
+        if any(s.mode == "tendon_tension" for s in self.robot.segments if s.tendons):
+            raise InputError(
+                f"robot {self.robot.name!r} is driven by forces, mode 'tendon_tension'; drives are commanded "
+                "lengths: give a robot of mode 'tendon_length'."
+            )
         if len(nodes) != self.robot.n_tendons:
             raise InputError(
                 f"there are {len(nodes)} drives and robot {self.robot.name!r} has "
