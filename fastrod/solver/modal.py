@@ -188,7 +188,7 @@ inertia is a number."""
 
 def no_hosts() -> ModalHost:
     """The motion of every base is prescribed."""
-    return ModalHost(np.zeros((0, 6, 6)), np.zeros((0, 6)), np.zeros((0, 6)), np.zeros((0, 6, 6)))
+    return ModalHost(*(np.zeros((0, 6, 6)[:k]) for k in (3, 3, 2, 2, 3)))
 
 
 def mean_by_end(how: Step) -> float:
@@ -208,8 +208,8 @@ def hosts_of(inverse_inertia: Floats, length: float) -> ModalHost:
     size = np.where(largest > 0.0, np.maximum(size, _LEAK * largest), 1.0)
     inertia = (axes / size[:, None]) @ np.swapaxes(axes, 1, 2)
     inertia = np.where(largest[:, :, None] > 0.0, inertia * unit * unit[:, None], 0.0)
-    n = len(inertia)
-    return ModalHost(inertia, np.zeros((n, 6)), np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan))
+    n, given = len(inertia), np.ascontiguousarray(inverse_inertia)
+    return ModalHost(inertia, given, np.zeros((n, 6)), np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan))
 
 
 class ModalSolver:

@@ -160,12 +160,13 @@ def test_rods_on_a_light_hinge_begin_at_rest():
 
 
 @pytest.mark.study
-def test_the_engines_agree():
+def test_the_engines_agree(monkeypatch):
+    monkeypatch.setattr("fastrod.hosts.carried._ALIKE", 0.0)  # what is just above it here may be below there
     hands = [Hand(engine, 3, 0.05, 0.005) for engine in ("pybullet", "mujoco")]
     for k in range(60):
         for hand in hands:
             assert hand.step(k)
-        assert_allclose(hands[0].velocity, hands[1].velocity, atol=1e-4)
+        assert_allclose(hands[0].velocity, hands[1].velocity, atol=2e-5)
 
 
 @pytest.mark.study

@@ -45,8 +45,8 @@ L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 
 L_PIVOT, L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 9, 18, 19, 20, 21
 
 # host: 1 where a base gives way, 1 in the first lane where any does; displacement of the base and its Newton
-# step; inertia of its body over kappa dt^2 (6, 6), its pose without the rod, kappa, the scheme, how many
-# times its spring the rod is, what a mean wrench has beyond that at the end, and where the base was
+# step; inertia of its body over kappa dt^2 (6, 6), its pose without the rod, kappa, the scheme, the trace
+# of P^-1 K, K what the rod resists, what a mean wrench has beyond that at the end, and where the base was
 G_ON, G_ANY, G_D, G_STEP, G_P = 0, 1, 2, 8, 14
 G_FREE, G_KAPPA, G_SCHEME, G_LIGHT, G_PULL, G_START, HOST = 50, 62, 63, 66, 67, 73, 76
 

@@ -60,6 +60,8 @@ class ModalHost(NamedTuple):
     inertia: Floats
     """(n_robots, 6, 6) about the base point, world: force [N] and moment [N m] by linear and angular
     acceleration; 0 where the motion of the base is prescribed."""
+    mobility: Floats
+    """(n_robots, 6, 6) its inverse, also of what is held in some directions."""
     moved: Floats
     """(n_robots, 6) out: displacement [m] and rotation vector of the base from `Ports.base_pose`, world."""
     wrench: Floats
@@ -300,7 +302,7 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
         forward(hessian(work), work.host_change[k * n_q * W : (k + 1) * n_q * W])
     demand_of_base(robots, b, motion, work, right)
     for w in range(W):
-        write(to, G_LIGHT, w, 1.0)
+        write(to, G_LIGHT, w, 0.0)
     for r in range(6):
         for c in range(r + 1):
             for w in range(W):
@@ -313,19 +315,19 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
                     )
                     write_at(matrix, r, c, w, at(matrix, r, c, w) - one * other)
             for w in range(W):
-                stiffness = at(matrix, r, c, w)
+                stiffness, i = at(matrix, r, c, w), robots[w]
                 if read(to, G_ON, w) > 0.0:
-                    host.stiffness[robots[w], r, c] = host.stiffness[robots[w], c, r] = stiffness
-                spring = read(to, G_P + 6 * r + c, w)
-                write_at(matrix, r, c, w, stiffness + spring)
-                if r == c and read(to, G_ON, w) > 0.0:
-                    write(to, G_LIGHT, w, max(read(to, G_LIGHT, w), abs(stiffness / spring)))
+                    host.stiffness[i, r, c] = host.stiffness[i, c, r] = stiffness
+                    gives = (1.0 if r == c else 2.0) * stiffness * host.mobility[i, r, c]
+                    write(to, G_LIGHT, w, read(to, G_LIGHT, w) + gives)
+                write_at(matrix, r, c, w, stiffness + read(to, G_P + 6 * r + c, w))
         for a in range(n_q):
             for w in range(W):
                 less = read(work.host_change, r * n_q + a, w) * read(work.gradient, a, w)
                 write(right, r, w, read(right, r, w) - less)
     for w in range(W):
-        on = read(to, G_ON, w) > 0.0
+        on, dt = read(to, G_ON, w) > 0.0, read(to, G_SCHEME + 1, w)
+        write(to, G_LIGHT, w, read(to, G_KAPPA, w) * dt * dt * read(to, G_LIGHT, w))
         for r in range(6):
             if not on:  # a base whose motion is prescribed
                 write(right, r, w, 0.0)
