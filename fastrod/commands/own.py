@@ -146,7 +146,9 @@ def new(
     if given["drive"] == "force" or any(question.name in said for question in _MATERIAL):
         given |= {question.name: _answer(question, answers, ask) for question in _MATERIAL}
     if given["drive"] != "force" and len(set(given.get("radius", [0.0]))) > 1:
-        raise InputError(f"--radius is {answers['radius']!r}; only with --drive force may a body taper.")
+        raise InputError(
+            "--radius has a base's and a tip's; a body tapers only with --drive force: give one radius."
+        )
     of_log = [name for name in said if name in _COLUMNS or name in [question.name for question in _FILE]]
     if log is None and (of_log or markers):
         raise InputError(f"--{(*of_log, 'markers')[0]} says how a log is read; give --log FILE, too.")
@@ -350,7 +352,7 @@ def _robot_text(name: str, given: dict[str, Any]) -> str:
         elif weighs:
             lines += [
                 f"bending_stiffness = [{bending:.6g}, {bending:.6g}]  # EI, N m^2, of {modulus / 1e3:g} kPa",
-                f"torsional_stiffness = {2.0 / 3.0 * bending:.6g}  # GJ, N m^2, of what keeps its volume",
+                f"torsional_stiffness = {2.0 / 3.0 * bending:.6g}  # GJ, N m^2, at Poisson's ratio 0.5",
                 f"body_radius = {radius[0]:.6g}",
                 f"line_density = {density * area:.6g}  # kg/m, of {density:g} kg/m^3",
             ]

@@ -261,14 +261,11 @@ class Rod:
         self, motion: Motion, given: Given, around: Given, time_step: float, n: int, freedom: Freedom | None
     ) -> State:
         wrench, free = self._wrench, motion if freedom is None else motion._replace(velocity=freedom.twist)
-        # of what the base gains a rod at rest has what gravity gives both: others move what bears it, too
-        pull = time_step * np.array(given.get("gravity", self.robot.gravity), float)
-        falls = ((free.velocity - motion.velocity)[:, :3] * pull).sum(1, keepdims=True)
-        falls = pull * np.clip(falls / max((pull**2).sum(-1).max(), 1e-30), 0.0, 1.0)
         if self._state is None or self._fresh.any():
             begins = given
             if self.simulator.dynamics:  # at rest on its base, which may fall
-                weight = (pull - falls) / time_step
+                gravity, fall = self._fall(motion, free, given, time_step)
+                weight = gravity - fall
                 begins = given | {"gravity": weight if self.n_robots else weight[0]}
             settle = self._settled if self._state is None else self._settled_again
             settle(motion.pose, begins, around)
@@ -276,7 +273,8 @@ class Rod:
         if self._still.any():
             if self.simulator.dynamics:
                 middle = np.array(np.broadcast_to(motion.velocity, wrench.shape))
-                middle[:, :3] += 0.5 * falls  # an engine's velocity is that of the middle of its last step
+                # an engine's velocity is that of the middle of its last step
+                middle[:, :3] += 0.5 * time_step * self._fall(motion, free, given, time_step)[1]
                 self.simulator.set_in_motion(middle, self._still)
             self._still[:] = False
         mobility = None if freedom is None or not self.simulator.dynamics else freedom.inverse_inertia
@@ -458,6 +456,14 @@ class Rod:
             state.rotation[:, :: self._nodes_per_capsule],
             self.radius,
         )
+
+    def _fall(self, motion: Motion, free: Motion, given: Given, time_step: float) -> tuple[Floats, Floats]:
+        """Gravity, (3,) or (n_robots, 3), and the acceleration (n, 3) [m/s^2] with which a base of this
+        `motion` falls, `free` of the rod, world: along gravity and no faster, for what other forces do to a
+        base is no fall."""
+        gravity = np.array(given.get("gravity", self.robot.gravity), float)
+        along = ((free.velocity - motion.velocity)[:, :3] * gravity).sum(1, keepdims=True) / time_step
+        return gravity, gravity * np.clip(along / max((gravity**2).sum(-1).max(), 1e-30), 0.0, 1.0)
 
     def _substeps(self, time_step: float) -> int:
         check_number("time_step", time_step, Bound(above=0.0, unit="s"))

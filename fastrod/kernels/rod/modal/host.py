@@ -61,7 +61,8 @@ class ModalHost(NamedTuple):
     """(n_robots, 6, 6) about the base point, world: force [N] and moment [N m] by linear and angular
     acceleration; 0 where the motion of the base is prescribed."""
     mobility: Floats
-    """(n_robots, 6, 6) its inverse, also of what is held in some directions."""
+    """(n_robots, 6, 6) its inverse [1/kg, 1/(kg m^2)], singular where the base is held in some
+    directions."""
     moved: Floats
     """(n_robots, 6) out: displacement [m] and rotation vector of the base from `Ports.base_pose`, world."""
     wrench: Floats
@@ -274,13 +275,13 @@ def _momentum(
 
 @kernel
 def demand_of_base(robots: Ints, b: ModalBasis, motion: ModalMotion, work: ModalWork, right: Lanes) -> None:
-    """Derivative of the energy by displacement and rotation of the bases, into `right` (6,), and G_PULL: zero
-    where P d = w."""
+    """Derivative of the energy by displacement and rotation of the bases, which is zero where P d = w, into
+    `right` (6,), and G_PULL."""
     to = work.host
     for w in range(W):
         force, moment = _from_outside(w, b, motion, work)
-        lost, turned = _gained(w, robots[w], b, motion, work)
-        force, moment = sub(force, lost), sub(moment, turned)
+        gained, turning = _gained(w, robots[w], b, motion, work)
+        force, moment = sub(force, gained), sub(moment, turning)
         for k in range(6):
             needed, mean = read(work.beyond[0], B_F + k, w), force[k] if k < 3 else moment[k - 3]
             write(to, G_PULL + k, w, -mean / read(to, G_KAPPA, w) - needed)
