@@ -294,15 +294,14 @@ class TouchingRods(ModalRods):
         found: PassShapes,
     ) -> Flags:
         """(n_robots,) who of these, in whole worlds, moved on over this fraction `span` of a step, along
-        which the inputs change evenly; the others are as they were."""
+        which the inputs change evenly from the first to the other; the others are as they were."""
         engine, motion, n = self.engine, self.modal.motion, self.n_robots
         (first, last), ok, one = span, np.zeros(n, bool), np.ones(n)
         if not len(rows):
             return ok
-        ports = inputs[1] if last >= 1.0 else blended(*inputs, np.full(n, last))
         start, contacts = copied(motion), ContactSet(*(a.copy() for a in engine.contact_set))
         how = Step(BDF1, (last - first) * self.stepper.time.dt)
-        ok = self._one(rows, acting, ports, how, (first * one, last * one), found, True)
+        ok = self._one(rows, acting, inputs[1], how, (first * one, last * one), found, True)
         engine.end_section(last - first, found.shape, ok)
         left = lost = rows[~ok[rows]]
         if not len(lost) or last - first < 1.5 * 4.0**-_DIVISIONS:
@@ -314,12 +313,13 @@ class TouchingRods(ModalRods):
         aside, step, mean = (np.zeros_like(host.moved) for _ in range(3))
         for k in range(4):
             fraction = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
+            ends = [blended(*inputs, 0.25 * j * one) if 0 < j < 4 else inputs[j // 4] for j in (k, k + 1)]
             if hosts := len(aside):  # a body goes on at the speed that the rod has given it
-                aside += step
                 arm = motion.place[:, :3] - place
-                one, other = (displaced(p.base_pose, aside) for p in inputs)
-                some = inputs[0]._replace(base_pose=one), inputs[1]._replace(base_pose=other)
-            left = left[self._advance_pressed(left, acting, some if hosts else inputs, fraction, found)[left]]
+                ends[0] = ends[0]._replace(base_pose=displaced(ends[0].base_pose, aside))
+                aside += step
+                ends[1] = ends[1]._replace(base_pose=displaced(ends[1].base_pose, aside))
+            left = left[self._advance_pressed(left, acting, (ends[0], ends[1]), fraction, found)[left]]
             if hosts:
                 step += host.moved
                 aside += host.moved
