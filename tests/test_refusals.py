@@ -130,30 +130,22 @@ INPUTS: Rows = [
     (lambda: settle(LENGTHS, base_pose=[0, 0, 0, 1, 1, 0, 0]), "norm"),
     (lambda: settle(LENGTHS, tolerance=0.0), "tolerance"),
     (lambda: settle(LENGTHS, line_force=np.zeros((2, 5, 3, 2))), "line_force has shape"),
-    (lambda: settle(LENGTHS, line_force="a"), "not an array of numbers"),
     (lambda: settle(LENGTHS, line_force=np.zeros((1, 1, 3))), "two or more"),
     (lambda: settle(LENGTHS, tension=[1.0] * 4), "no segment of this robot"),
-    (lambda: settle([0.07j] * 4), "not an array of numbers"),
-    (lambda: settle(LENGTHS, tolerance="x"), "must be a number"),
-    (lambda: settle(LENGTHS, point_force=0), "pairs"),
-    (lambda: settle(LENGTHS, point_force=[("a", (0, 0, 1))]), "pairs"),
     (lambda: three().settle(REST, tolerance=HUGE), r"tolerance is 1000.* m; it must be a number"),
     (
         lambda: step(tip_force=(0.0, 0.0, 1e13)),
         r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 1\.e\+13\]\.",
     ),
     (lambda: step(tip_force=[HUGE, 0, 0]), "tip_force is not an array of numbers"),
-    (lambda: step(tip_force=np.zeros(3, "datetime64[s]")), "tip_force is not an array of numbers"),
     (lambda: step(point_force=[(HUGE, (0, 0, 1))]), "point_force must be"),
     (lambda: reacher().restore("x"), r"^the snapshot is 'x'; give what Simulator.snapshot\(\) returned"),
     (lambda: reacher().step(dt=0.1), r"^step has no input 'dt'; the time step is given once: Simulator\("),
     (lambda: reacher().settle(tip_forc=(0, 0, 1)), "^settle has no input 'tip_forc'; did you mean"),
     (lambda: reacher().step(MASKED), "^tendon_length is a masked array that hides 1 of 15 entries"),
-    (lambda: reacher().step([MASKED]), "tendon_length is a masked array"),
     (lambda: reacher().step(HOME, tip_force=FORCE), "tip_force is a masked array"),
     (lambda: reacher().step(HOME, point_force=[(0.1, FORCE)]), "point_force is a masked array"),
     (lambda: reacher().step(HOME, point_force=[(PLACE, (0, 0, 1))]), "arclength"),
-    (lambda: reacher().step(HOME, gravity=FORCE), "gravity is a masked array"),
     (lambda: reacher().step(HOME, gravity=9.81), r"gravity has shape \(\); it must be"),
     (lambda: reacher().settle(HOME, rows=np.ma.array([0], mask=[True])), "rows is a masked array"),
     (
@@ -181,19 +173,12 @@ SIMULATORS: Rows = [
     (lambda: Simulator(rod(), n_robots=0), "n_robots is 0"),
     (lambda: Simulator(rod(), n_robots=2.5), "whole number"),
     (lambda: Simulator(rod(), n_robots=HUGE), "take fewer"),
-    (lambda: Simulator(rod(), points_per_segment=HUGE), "take fewer"),
-    (lambda: Simulator(rod(), dt=-1.0), "dt is -1.0"),
     (lambda: Simulator(rod(), points_per_segment=1), "at least 2"),
     (lambda: Simulator(rod(), outputs="tips"), "'full' or 'tip'"),
     (lambda: Simulator(rod(), threads=1000), "threads is 1000"),
-    (lambda: Simulator(rod(), threads=1.5), "threads is 1.5"),
-    (lambda: Simulator(rod(), dt="a"), "dt is 'a'"),
-    (lambda: Simulator(rod(), solver=3), "solver is 3"),
     (lambda: Simulator(REACHER, 10**12), r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB"),
-    (lambda: Simulator(REACHER, 10**30), "would take"),
     (lambda: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
-    (lambda: Simulator(REACHER, 2, points_per_segment=10**30), "would take"),
     (lambda: Observer(kept_jacobian_tolerance=-1e-9), "Observer.kept_jacobian_tolerance"),
     (lambda: Simulator(rod()).jacobian(), "call step or settle first"),
     (lambda: Simulator(rod()).compliance(), "call step or settle first"),
@@ -251,7 +236,6 @@ MOTION: Rows = [
         r"^segment 1 of 'tendon_length' has line_density 0 kg/m, and dynamics=True needs",
     ),
     (lambda: moving(rod("paper", line_density=0.1)), "^mode 'paper' has no energy, and so no modes; take"),
-    (lambda: Simulator(rod("paper"), solver="modal"), "^mode 'paper' has no energy, and so no modes; take"),
     (lambda: Simulator(rod(), solver="modl"), "^solver is 'modl'; did you mean 'modal'"),
     (lambda: Simulator(rod(), solver=3), "^solver is 3; known: modal, observer"),
     (
@@ -295,13 +279,10 @@ MOTION: Rows = [
     (lambda: settled(rod()).frequencies(), "^frequencies needs inertia; give Simulator"),
     (lambda: settled_moving().frequencies(0), "^count is 0; give a whole number, at least 1"),
     (lambda: settled_moving().frequencies(99), "^count is 99; these rods have 10 unknowns: give more modes"),
-    (lambda: settled_moving().settle(REST, tolerance=0.0), "^tolerance is 0.0 m"),
 ]
 
 ROBOTS: Rows = [
     (lambda: Lump(at=-0.01, mass=0.1), "^Lump.at is -0.01 m; it must lie on its segment"),
-    (lambda: Lump(at="end", mass=0.1), "^Lump.at is 'end' m; it must lie on its segment"),
-    (lambda: Lump(at=0.01, mass=-0.1), "^Lump.mass is -0.1 kg; it must be zero or positive"),
     (lambda: Lump(at=0.01, mass=0.1, inertia=1.0), "^Lump.inertia is 1.0; give the three moments"),
     (lambda: Lump(at=0.01, mass=0.1, inertia=(1.0, 1.0, 3.0)), "no body has it"),
     (lambda: rod(lumps=(Lump(at=0.08, mass=0.1),)), "^Lump.at is 0.08 m, beyond the 0.07 m of its segment"),
@@ -310,11 +291,27 @@ ROBOTS: Rows = [
         lambda: Simulator([rod(lumps=(Lump(at=0.01, mass=0.1),)), rod()]),
         "^robot 1 of the batch has lumps on other segments than robot 0, or more or fewer",
     ),
-    (lambda: rod(damping_time=-1e-3), "^Segment.damping_time is -0.001 s; it must be zero or positive"),
-    (lambda: rod(damping_time="long"), "^Segment.damping_time is 'long' s"),
-    (lambda: rod(axial_stiffness=0.0), "^Segment.axial_stiffness is 0.0 N; it must be positive, or left out"),
-    (lambda: rod(shear_stiffness=math.nan), "^Segment.shear_stiffness is nan N; it must be positive"),
-    (lambda: loads(A + "lumps = [{at = 0.08, mass = 0.1}]\n" + TENDON + "}]"), "beyond the 0.07 m"),
+    *(
+        (lambda name=name, value=value: rod(**{name: value}), rf"^Segment\.{name} is .*; it must be ")
+        for name, value in (
+            *(
+                ("damping_time", -1e-3),
+                ("damping_time", "long"),
+                ("axial_stiffness", 0.0),
+                ("length", 1e-300),
+            ),
+            *(("shear_stiffness", math.nan), ("torsional_stiffness", 1e200), ("line_density", 1e300)),
+        )
+    ),
+    *(
+        (
+            lambda given=given: Tendon(**{"offset": 0.01, "angle": 0.0} | given),
+            r"^Tendon\.\w+ is .*; it must be ",
+        )
+        for given in ({"offset": 5e-324}, {"compliance": 1e300}, {"pretension": 1e300})
+    ),
+    (lambda: rod(bending_stiffness=(1e-300, 1.0)), r"1e-300 N m\^2; it must be between 1e-20 and 1e\+15"),
+    (lambda: Lump(at=0.01, mass=-0.1), "^Lump.mass is -0.1 kg; it must be zero or positive"),
     (lambda: loads(A + "lumps = [{at = 0.01, mas = 0.1}]\n" + TENDON + "}]"), "did you mean 'mass'"),
     (lambda: loads(A + "lumps = [{at = 0.01}]\n" + TENDON + "}]"), "mass"),
     (lambda: loads(A + "damping_tme = 0.1\n" + TENDON + "}]"), "did you mean 'damping_time'"),
@@ -333,7 +330,6 @@ ROBOTS: Rows = [
     (lambda: loads(A + 'mode = "passive"\n[base]\nquaternion = [1, 1, 0, 0]'), "it must be 1"),
     (lambda: loads("name = "), "not TOML"),
     (lambda: Simulator("prototype"), "load_robot"),
-    (lambda: Simulator(["prototype"]), "load_robot"),
     (lambda: Simulator(None), "load_robot"),
     (lambda: Simulator([]), "load_robot"),
     (lambda: Simulator([rod(n_tendons=3), rod(n_tendons=4)]), "n_tendons 4, robot 0 has 3"),
@@ -357,7 +353,6 @@ ROBOTS: Rows = [
     ),
     (lambda: load_robot("a\0.toml"), r"robot file 'a\\x00.toml' cannot be read: embedded null byte\."),
     (lambda: load_robot(LONG), r"cannot be read: File name too long\."),
-    (lambda: load_robot("a\ud800.toml"), r"cannot be read: .*surrogates not allowed"),
     (
         lambda: loads("x = " + "[" * 100_000),
         "robot file is not a robot: its tables stand too deep in one another",
@@ -381,27 +376,10 @@ ROBOTS: Rows = [
         lambda: sensor("noise = -1e-3"),
         r"\[sensor\] noise is -0.001; it must be zero or positive, and finite\.",
     ),
-    (lambda: sensor("noise = nan"), r"\[sensor\] noise is nan; it must be zero or positive"),
-    (
-        lambda: rod(bending_stiffness=(1e-300, 1.0)),
-        r"bending_stiffness is 1e-300 N m\^2; it must be between 1e-20 and 1e\+15",
-    ),
-    (lambda: rod(torsional_stiffness=1e200), r"torsional_stiffness is 1e\+200 N m\^2; it must be between"),
-    (lambda: rod(length=1e-300), r"Segment.length is 1e-300 m; it must be between 1e-06 and inf m"),
-    (
-        lambda: Tendon(offset=5e-324, angle=0.0),
-        r"Tendon.offset is 5e-324 m; it must be between 1e-06 and 10 m",
-    ),
-    (
-        lambda: Tendon(offset=0.01, angle=0.0, compliance=1e300),
-        "compliance is 1e.300 m/N; it must be zero or positive",
-    ),
-    (lambda: Tendon(offset=0.01, angle=0.0, pretension=1e300), "Tendon.pretension is 1e.300 N"),
     (
         lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)),
         r"Robot.gravity is \[0.0, 0.0, 1e\+300\]; its numbers must be between",
     ),
-    (lambda: rod(line_density=1e300), "Segment.line_density is 1e.300 kg/m"),
     *(
         (
             lambda robots=robots: settled(rod(), 3).replace([0], robots),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 import weakref
@@ -26,6 +27,7 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
+_LEARNS = 0.2  # of what holds a body, a step, where rods are as heavy as it is
 _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
 _RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
     weakref.WeakValueDictionary
@@ -40,6 +42,20 @@ class _Begun(NamedTuple):
     motion: Motion
     given: dict[str, Any]
     """Inputs of the rod, but those of its base."""
+
+
+class _Support(NamedTuple):
+    """Acceleration of a rod's base by what holds it and its host does not know of."""
+
+    before: Floats
+    """(6,) velocity of the base before the last step."""
+    after: Floats
+    """(6,) that it was expected to have after it."""
+    held: Floats
+    """(6,) acceleration that is taken to hold it [m/s^2, rad/s^2]."""
+
+
+_UNKNOWN = _Support(np.full(6, np.nan), np.full(6, np.nan), np.zeros(6))
 
 
 class CarriedRod(ABC):
@@ -72,6 +88,7 @@ class CarriedRod(ABC):
         self.wrench: Floats = np.zeros(6)
         """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
         self._begun: _Begun | None = None
+        self._support = _UNKNOWN
         self.body_contacts = ()
         self._every = _RODS[world]
         self._every[id(self)] = self
@@ -112,6 +129,7 @@ class CarriedRod(ABC):
         """Settle the rod where its host is now; inputs as for `step`. The host feels nothing yet."""
         inputs = _checked(inputs)
         self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **inputs)
+        self._support = _UNKNOWN
         self._place()
         return self.state
 
@@ -165,7 +183,7 @@ class CarriedRod(ABC):
         """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put
         somewhere else. The next step settles where the host then is."""
         self.rod.reset()
-        self.state, self._begun, self.wrench = None, None, np.zeros(6)
+        self.state, self._begun, self.wrench, self._support = None, None, np.zeros(6), _UNKNOWN
         self._release()
         for contact in self.body_contacts:
             contact.forget()
@@ -197,6 +215,9 @@ class CarriedRod(ABC):
         every, exerted = freedom.inverse_inertia, np.stack([np.zeros(6), *(rod.wrench for rod in rods[1:])])
         bare = freedom.twist - self.dt * every @ exerted.ravel()
         before, places = self.rod.snapshot(), np.arange(6 * len(rods)).reshape(-1, 6)
+        if freedom.may_be_held:
+            self._support = self._supported(motion, every[:6, :6])
+            bare += self.dt * np.concatenate([rod._support.held for rod in rods])
         for count in range(_ROUNDS):
             agreed = True
             for k, rod in enumerate(rods):
@@ -217,8 +238,32 @@ class CarriedRod(ABC):
                 exerted[k], agreed = rod.wrench, agreed and count == k == 0
             if agreed:
                 break
+        for rod, twist in zip(rods, (bare + self.dt * every @ exerted.ravel()).reshape(-1, 6), strict=True):
+            rod._support = rod._support._replace(after=twist)
         assert self.state is not None
         return self.state
+
+    def _supported(self, motion: Motion, mobility: Floats) -> _Support:
+        """Find what holds the base in the coming step: of what moved it in the last one beyond what was
+        expected there, as much as holds it against all else, for an impact passes.
+
+        On the inertia of their body, of this `mobility` (6, 6), which is a spring within a step, and on what
+        holds it, which adds up over steps, rods stand as under a PI controller. Along each axis of the
+        mobility it learns the more slowly the heavier they are there, or they would swing up.
+        """
+        before, after, held = self._support
+        if not np.isfinite(after).all():
+            return _Support(motion.velocity, after, held)
+        rods = [self, *(rod for rod in self._others() if self._host.moves_with(rod._host))]
+        mass = float(sum(s.length * s.line_density for rod in rods for s in rod.rod.robot.segments))
+        unit = np.repeat([1.0, self.rod.robot.length / math.sqrt(3.0)], 3)  # that a straight rod gyrates by
+        heavy, along = np.linalg.eigh(mass * unit[:, None] * mobility * unit)
+        learns = along * np.minimum(1.0, _LEARNS / np.maximum(heavy, 1e-300)) @ along.T
+        held, found = unit * held, unit * ((motion.velocity - after) / self.dt + held)
+        alone = unit * (after - before) / self.dt - held
+        found *= min(1.0, max(0.0, -float(found @ alone) / max(float(found @ found), 1e-300)))
+        held = held * (found @ held >= 0.0)
+        return _Support(motion.velocity, after, (held + learns @ (found - held)) / unit)
 
     def _others(self) -> list[CarriedRod]:
         """All other rods of this world."""

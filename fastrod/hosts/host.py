@@ -45,6 +45,8 @@ class Freedom(NamedTuple):
     twist: Floats
     """(6,) of the base at the end of the step if there were no rod, by which it also goes there, world:
     engines step velocities first."""
+    may_be_held: bool = False
+    """Whether the twist leaves out what holds the body against its rods, as a floor does."""
 
 
 class Host(Protocol):

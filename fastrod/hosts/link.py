@@ -99,7 +99,7 @@ class BulletLink:
             mobility = self._alone(carrier, [motion.pose[:3] for motion in motions])
         for k, (_, wrench) in enumerate(others, 1):
             twist += dt * mobility[:, 6 * k : 6 * k + 6] @ wrench
-        return Freedom(mobility, twist)
+        return Freedom(mobility, twist, carrier not in (None, -2) and not self._joints())
 
     def _by_joints(self, hosts: Sequence[BulletLink]) -> tuple[Floats, Floats]:
         """J M^-1 J^T of a body that stands, and the accelerations by its motors."""

@@ -182,7 +182,7 @@ class MujocoBody:
             lib.mj_solveM(model, data, by_force, jacobian)
         gained = jacobian @ data.qacc + 0.5 * change @ data.qvel  # the latter bends the base's path
         given = np.concatenate([host._given_velocity(host._base()[:3]) for host in hosts])
-        return Freedom(jacobian @ by_force.T, jacobian @ data.qvel + given + dt * gained)
+        return Freedom(jacobian @ by_force.T, jacobian @ data.qvel + given + dt * gained, True)
 
     def exert(self, wrench: Floats) -> None:
         """Force and moment about the base point, world, during the next mj_step, and until `release`."""

@@ -13,7 +13,7 @@ from fastrod.errors import InputError, Problem, shown
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.motion import ModalMotion
 from fastrod.model.robot import Robot
-from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
+from fastrod.rotation import displaced, matrix_from_quaternion, quaternion_from_vector
 from fastrod.solver.boundary import new_shape
 from fastrod.solver.inputs import Inputs, arclengths, checked_mobility
 from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, mean_by_end, no_hosts
@@ -172,10 +172,8 @@ class ModalRods:
             return ports
         alone = np.isnan(host.wrench[:, 0])  # at rest, or in shorter steps
         host.wrench[alone] = found.shape.base_wrench[alone]
-        pose = np.array(np.broadcast_to(ports.base_pose, (self.n_robots, 7)))
-        pose[:, :3] += host.moved[:, :3]
-        pose[:, 3:] = product(quaternion_from_vector(host.moved[:, 3:]), pose[:, 3:])
-        return ports._replace(base_pose=pose)
+        pose = np.broadcast_to(ports.base_pose, (self.n_robots, 7))
+        return ports._replace(base_pose=displaced(pose, host.moved))
 
     def response(self, acting: Acting, warm: Flags) -> LinearResponse:
         """Return the linear response of the last shape."""

@@ -40,9 +40,8 @@ from fastrod.solver.stepper import PassShapes, came_from, copied, put
 from fastrod.types import CANDIDATE, ContactMotion, ContactSet, Flags, Floats, Ints, Ports, RodShape
 
 # passes at most; those in which contacts follow the places where the gap is least, and at most where each
-# step is shorter than so much of the one before: of a step in motion, of one whose base gives way (parts of a
-# step lead it elsewhere than its engine, which takes one), and of one to a rest
-_IN_MOTION, _GIVING_WAY, _TO_REST, _FALLING = (8, 2, 2), (16, 2, 2), (40, 4, 16), 0.7
+# step is shorter than so much of the one before: of a step in motion, and of one to a rest
+_IN_MOTION, _TO_REST, _FALLING = (8, 2, 2), (40, 4, 16), 0.7
 _STAYS = 0.02  # of an integration step: a contact that moves by less is where it was
 _SWINGS = 12  # steps back in which the steps must have become half as long
 _BACK_AND_FORTH, _SHORTEST = 2, 0.2  # swings after which steps are shortened, and by how much at most
@@ -375,8 +374,9 @@ class TouchingRods(ModalRods):
         unit = np.concatenate([np.full(n_q, length), np.repeat([1.0 / length, 1.0], 3)])[: q.shape[1]]
         then = ContactSet(*(a.copy() for a in contacts))
         moves = self.dynamics and not self._resting
-        moved = _GIVING_WAY if len(modal.host.inertia) else _IN_MOTION
-        most, moving, longest = moved if moves else _TO_REST
+        most, moving, longest = _IN_MOTION if moves else _TO_REST
+        # parts of a step lead a body that gives way elsewhere than its engine, which takes one
+        most *= 2 if moves and len(modal.host.inertia) else 1
         if not follow:
             moving = longest = 0
         # last step, the least one that halved in time, and what the last leaves to be done [rad]
@@ -471,14 +471,14 @@ class TouchingRods(ModalRods):
 
     def _bases(self, ports: Ports, h: float) -> Floats:
         """(n_robots, 6, none where no base gives way) from where the bases would be without the rods to where
-        these have led them in a time h."""
+        these have brought them in a time h."""
         motion, n = self.modal.motion, self.n_robots
         if not len(self.modal.host.inertia):
             return np.zeros((n, 0))
         now, rate = (a[:, :12].reshape(n, 4, 3) for a in (motion.place, motion.velocity))
         turned = quaternion_from_matrix(now[:, 1:].swapaxes(1, 2))
-        led = h * np.concatenate([rate[:, 0], 0.5 * np.cross(now[:, 1:], rate[:, 1:]).sum(1)], axis=1)
-        ends = displaced(np.concatenate([now[:, 0], turned], axis=1), led)
+        went = h * np.concatenate([rate[:, 0], 0.5 * np.cross(now[:, 1:], rate[:, 1:]).sum(1)], axis=1)
+        ends = displaced(np.concatenate([now[:, 0], turned], axis=1), went)
         return displacement(np.broadcast_to(ports.base_pose, (n, 7)), ends)
 
     def _note_stiffness(self, rows: Ints, hessian: Floats, n_q: int, how: Step) -> None:

@@ -26,7 +26,6 @@ from fastrod_device.errors import DeviceError
 
 DOWN = np.array([0.0, 0.0, -1.0])
 STILL = np.zeros(3)
-STIFF = 1e-9  # m/N: tendons that do not stretch
 ABOUT_X = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 
 

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from fastrod.hosts import BulletLink, MountedRod, MujocoBody, MujocoRod, add_capsules
+from fastrod.rotation import displacement
 
 BOTH = ("pybullet", "mujoco")
 TWIST = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0])
@@ -135,6 +136,32 @@ def test_a_body_stands_on_four_legs(engine, dt):
         borne.append(sum(rod.wrench[2] for rod in rods))
     assert_allclose(height[round(0.1 / dt) :], 0.112, atol=1e-4)
     assert np.mean(borne[round(0.3 / dt) :]) == pytest.approx(mass * 9.81, rel=0.01)
+
+
+def test_a_rod_is_where_the_floor_holds_its_body():
+    world, damped = empty_world(0.01, 9.81), soft_robot(line_density=0.2, damping_time=0.05)
+    world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_PLANE))
+    rod = MountedRod(damped, BulletLink(world, cube(world, 0.06, 0.1, [0.0, 0.0, 0.03])))
+    for _ in range(100):
+        rod.step()
+    off = displacement(rod.rod.base, rod.host.motion().pose)
+    assert np.abs(off[:3]).max() < 1e-6  # 1 mm of a body that falls in each step
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("tilt", [0.8, 1.2, 2.0])
+def test_two_rods_are_thrown_on_the_floor_with_their_light_body(tilt):
+    world = empty_world(0.01, 9.81)
+    floor = [world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_PLANE))]
+    body = cube(world, 0.06, 0.04, [0.0, 0.0, 0.25])
+    turned = [Rotation.from_rotvec([a, 0, 0]).as_quat(scalar_first=True) for a in (tilt, tilt + np.pi)]
+    rods = [MountedRod(ROD, BulletLink(world, body, quaternion=q), contact_bodies=floor) for q in turned]
+    world.resetBaseVelocity(body, [0.0, 0.0, -3.0])
+    for _ in range(60):
+        assert all(rod.begin().ok[0] for rod in rods)
+        world.stepSimulation()
+        for rod in rods:
+            rod.end()
 
 
 def test_a_rod_may_settle_again_after_it_has_begun():
