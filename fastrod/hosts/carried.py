@@ -27,7 +27,9 @@ from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _DAMPING = 0.1  # s, of a rod without mass: a choice, not a measurement
-_LEARNS = 0.2  # of what holds a body, a step, where rods are as heavy as it is
+# of what holds a body, in a step, where rods are as heavy as it is; and by how much of it such a one may
+# accelerate all the same
+_LEARNS, _HOLDS = 0.2, 0.5
 _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of their wrenches
 _RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
     weakref.WeakValueDictionary
@@ -244,8 +246,8 @@ class CarriedRod(ABC):
         return self.state
 
     def _supported(self, motion: Motion, mobility: Floats) -> _Support:
-        """Find what holds the base in the coming step: of what moved it in the last one beyond what was
-        expected there, as much as holds it against all else, for an impact passes.
+        """Find what holds the base in the coming step: what moved it in the last one beyond what was expected
+        there, if it hardly accelerated.
 
         On the inertia of their body, of this `mobility` (6, 6), which is a spring within a step, and on what
         holds it, which adds up over steps, rods stand as under a PI controller. Along each axis of the
@@ -261,8 +263,8 @@ class CarriedRod(ABC):
         learns = along * np.minimum(1.0, _LEARNS / np.maximum(heavy, 1e-300)) @ along.T
         held, found = unit * held, unit * ((motion.velocity - after) / self.dt + held)
         alone = unit * (after - before) / self.dt - held
-        found *= min(1.0, max(0.0, -float(found @ alone) / max(float(found @ found), 1e-300)))
-        held = held * (found @ held >= 0.0)
+        if np.linalg.norm(alone + found) > _HOLDS * np.linalg.norm(found):
+            found = np.zeros(6)  # as of an impact, which passes
         return _Support(motion.velocity, after, (held + learns @ (found - held)) / unit)
 
     def _others(self) -> list[CarriedRod]:
