@@ -216,6 +216,7 @@ class CarriedRod(ABC):
         freedom = self._host.freedom(self.dt, [(rod._host, rod.wrench) for rod in rods[1:]])
         every, exerted = freedom.inverse_inertia, np.stack([np.zeros(6), *(rod.wrench for rod in rods[1:])])
         bare = freedom.twist - self.dt * every @ exerted.ravel()
+        self.rod.start(motion, bare[:6], self.dt, **given)
         before, places = self.rod.snapshot(), np.arange(6 * len(rods)).reshape(-1, 6)
         if freedom.may_be_held:
             self._support = self._supported(motion, every[:6, :6])

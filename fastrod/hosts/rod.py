@@ -261,22 +261,8 @@ class Rod:
         self, motion: Motion, given: Given, around: Given, time_step: float, n: int, freedom: Freedom | None
     ) -> State:
         wrench, free = self._wrench, motion if freedom is None else motion._replace(velocity=freedom.twist)
-        if self._state is None or self._fresh.any():
-            begins = given
-            if self.simulator.dynamics:  # at rest on its base, which may fall
-                gravity, fall = self._fall(motion, free, given, time_step)
-                weight = gravity - fall
-                begins = given | {"gravity": weight if self.n_robots else weight[0]}
-            settle = self._settled if self._state is None else self._settled_again
-            settle(motion.pose, begins, around)
-        self.simulator.dt = h = time_step / n
-        if self._still.any():
-            if self.simulator.dynamics:
-                middle = np.array(np.broadcast_to(motion.velocity, wrench.shape))
-                # an engine's velocity is that of the middle of its last step
-                middle[:, :3] += 0.5 * time_step * self._fall(motion, free, given, time_step)[1]
-                self.simulator.set_in_motion(middle, self._still)
-            self._still[:] = False
+        h = time_step / n
+        self._begin(motion, free, given, around, time_step, h)
         mobility = None if freedom is None or not self.simulator.dynamics else freedom.inverse_inertia
         for k in range(n):
             obstacles = self._obstacles_after(around, n - k) if n > 1 else around
@@ -286,6 +272,42 @@ class Rod:
             self._capsules = moved(before, self._capsules, time_step)
         self.time += time_step
         return self.state
+
+    def start(self, motion: Motion, free_twist: Floats, time_step: float, **inputs: Any) -> None:
+        """Let rods that have no shape yet, or were reset, begin on bases of this `motion`, which would have
+        `free_twist` (6,) after the next step, of `time_step` [s], if there were no rod. Inputs as for
+        `advance`, which does this by itself: this is for several rods on one body, which fall with it as if
+        it had none of them. Raises as `advance`."""
+        given, around = self._sorted(inputs)
+        bases, before = Motion(np.atleast_2d(motion.pose), np.atleast_2d(motion.velocity)), self.snapshot()
+        free = bases._replace(velocity=np.atleast_2d(free_twist))
+        try:
+            self._begin(bases, free, given, around, time_step, time_step)
+        except Exception:
+            self.restore(before)
+            raise
+
+    def _begin(
+        self, motion: Motion, free: Motion, given: Given, around: Given, time_step: float, h: float
+    ) -> None:
+        """Rods that have no shape, or were reset, come to rest on their bases and move with them, in steps of
+        `h` [s]."""
+        moves = self.simulator.dynamics
+        if self._state is None or self._fresh.any():
+            begins = given
+            if moves:  # at rest on its base, which may fall
+                gravity, fall = self._fall(motion, free, given, time_step)
+                weight = gravity - fall
+                begins = given | {"gravity": weight if self.n_robots else weight[0]}
+            settle = self._settled if self._state is None else self._settled_again
+            settle(motion.pose, begins, around)
+        self.simulator.dt = h
+        if self._still.any() and moves:
+            middle = np.array(np.broadcast_to(motion.velocity, self._wrench.shape))
+            # an engine's velocity is that of the middle of its last step
+            middle[:, :3] += 0.5 * time_step * self._fall(motion, free, given, time_step)[1]
+            self.simulator.set_in_motion(middle, self._still)
+        self._still[:] = False
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put
