@@ -102,7 +102,9 @@ def _main(path: str, kind: str, memory: str) -> int:
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
     try:
         for array in read(path, kind):
-            np.save(sys.stdout.buffer, array, allow_pickle=False)
+            # numpy asks a stdout that is buffered for its place, and a pipe has none
+            np.save(out := io.BytesIO(), array, allow_pickle=False)
+            sys.stdout.buffer.write(out.getbuffer())
     except MemoryError:
         print("memory", file=sys.stderr)
         return 3

