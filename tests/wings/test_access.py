@@ -401,7 +401,7 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     assert until(lambda: other.value == 0.0 and bend.value == 20.0)  # they go back
     assert_array_equal(link.read().dl, before)
     answered(two)  # the one that may not drive stops
-    assert link.stopped
+    assert until(lambda: link.stopped)  # a moment after the page says so
     two.press(page.go_on)
     assert until(lambda: two.number in app._panels._noted)
     assert page.session.stopped
