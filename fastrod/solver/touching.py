@@ -312,9 +312,8 @@ class TouchingRods(ModalRods):
         before, host, place = engine.before, self.modal.host, motion.place[:, :3].copy()
         aside, step, mean = (np.zeros_like(host.moved) for _ in range(3))
         stages = [inputs[0], *(blended(*inputs, 0.25 * j * one) for j in (1, 2, 3)), inputs[1]]
-        for k in range(4):
+        for k, ends in enumerate(map(list, itertools.pairwise(stages))):
             fraction = first + (last - first) * k / 4.0, first + (last - first) * (k + 1) / 4.0
-            ends = stages[k : k + 2]
             if hosts := len(aside):  # a body goes on at the speed that the rod has given it
                 arm = motion.place[:, :3] - place
                 ends[0] = ends[0]._replace(base_pose=displaced(ends[0].base_pose, aside))
