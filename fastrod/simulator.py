@@ -66,11 +66,12 @@ class Simulator(RobotBatch):
         five-segment robot.
 
         `solver` is a `fastrod.Observer`, one forward integration a step (the default), or a `fastrod.Modal`:
-        rods of curvature modes, which robots with axial or shear stiffness or with inertia take; "observer"
-        and "modal" stand for both as they are. `dynamics=True` and a `scheme` stand for `Modal(dynamics=True,
-        scheme=...)`: a step moves a robot on by `dt`, and every segment needs a line_density, or without mass
-        a damping_time. Without `recover` a robot whose pass diverges in a step is lost at once: a step then
-        ends after its one pass, where the search for a shape that does not exist takes some thousand.
+        rods of curvature modes, which robots with axial or shear stiffness or with inertia take, and those
+        heavy for their stiffness; "observer" and "modal" stand for both as they are. `dynamics=True` and a
+        `scheme` stand for `Modal(dynamics=True, scheme=...)`: a step moves a robot on by `dt`, and every
+        segment needs a line_density, or without mass a damping_time. Without `recover` a robot whose pass
+        diverges in a step is lost at once: a step then ends after its one pass, where the search for a shape
+        that does not exist takes some thousand.
 
         `contact` is what the rods may touch; without it they pass through everything. Without `feel_contact`
         they do so all the same, and the scene is for `clearance`, `swept_clearance` and `ray_cast` alone. The

@@ -15,6 +15,7 @@ from test_simulator_rows import FIELDS, MOTION, ROWS, N, carried, stiffer
 
 from fastrod import Lump, Modal, Modes, Robot, Simulator, State
 from fastrod.errors import InputError, RobotError
+from fastrod.model.routing import route
 
 MOVING = {"dynamics": True, "dt": 2e-3}
 STILL = {"solver": "modal"}
@@ -278,3 +279,25 @@ def test_gravity_that_is_given_once_is_given_once(options: dict[str, Any]) -> No
     ]
     weight = 0.1 * 0.07 + 0.01
     assert_allclose(forces, [[weight, 0.0, 0.0], [0.0, 0.0, -9.81 * weight]], atol=1e-12)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 9.81), (9.81, 0.0, 0.0), (0.0, 0.0, -9.81)])
+def test_robots_heavy_for_their_stiffness_are_of_as_many_modes_as_they_need(gravity: Any) -> None:
+    robot = Robot(name="heavy", segments=rod(length=0.15, line_density=0.45).segments * 2, gravity=gravity)
+    sims = Simulator(robot, 8), Simulator(robot, 8, solver=Modal(modes=Modes(6, 4, pieces=6)))
+    bends = np.random.default_rng(3).uniform(-0.6, 0.6, (8, 2, 2))
+    rests = [sim.settle(robot.rest_tendon_length + route(robot).tendon_change(bends)) for sim in sims]
+    assert sims[0].solver == "modal"
+    assert rests[0].ok.all()
+    assert_allclose(*(rest.tip_position for rest in rests), atol=1e-4 * robot.length)
+
+
+@pytest.mark.parametrize("weight", [7.8, 7.9, 20.0, 200.0])
+def test_an_upright_rod_falls_to_a_side_beyond_what_it_bears(weight: float) -> None:
+    # 7.837 EI/L^2 (Greenhill 1881)
+    robot = rod("passive", length=0.4, line_density=weight * 0.0022 / 0.4**3 / 9.81)
+    rest, pushed = (Simulator(robot, solver="modal") for _ in range(2))
+    pushed.settle(tip_force=(1e-3 * weight, 0.0, 0.0))
+    heights = [sim.settle().tip_position[0, 2] for sim in (rest, pushed)]
+    assert_allclose(*heights, atol=1e-5)
+    assert (heights[0] < 0.4 - 1e-4) == (weight > 7.837)

@@ -17,8 +17,10 @@ from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
+from fastrod.simulator import Simulator
 from fastrod.solver.boundary import BoundarySolver, new_shape
 from fastrod.solver.inputs import Inputs, Reader
+from fastrod.solver.options import Modal, solver_of
 from fastrod.solver.settle import settle
 from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 
@@ -52,6 +54,9 @@ class ChainSolver:
         self._rows = np.arange(n)
         self._past: list[Floats] = []
         self._near = _NEAR * float(self.params.rod_length[0])
+        self._rods: Simulator | None = None  # of a robot that the observer does not solve
+        if isinstance(solver_of([robot]), Modal):
+            self._rods = Simulator(robot, n, points_per_segment=points_per_segment, threads=threads)
 
     def settle(self, given: Inputs, tolerance: float) -> Settled:
         """The next shapes of all chains: inputs as for `Simulator.settle`, each robot's own, boundary
@@ -59,6 +64,9 @@ class ChainSolver:
 
         Raises `InputError` for inputs that no robot can have; a row that does not converge is not ok.
         """
+        if self._rods is not None:
+            state = self._rods.settle(**given._asdict(), tolerance=tolerance)
+            return Settled(state.as_shape(), state.ok)
         ports = self._reader.ports(given)
         shape = new_shape(self.layout, self._passes.n_robots, "full", holes=True)
         left = self._rows if not self._past else self._follow(ports, shape, tolerance)

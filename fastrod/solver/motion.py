@@ -18,7 +18,7 @@ from fastrod.solver.boundary import new_shape
 from fastrod.solver.inputs import Inputs, arclengths, checked_mobility
 from fastrod.solver.modal import SCHEMES, ModalSolver, Step, hosts_of, mean_by_end, no_hosts
 from fastrod.solver.modal_response import ModalLinear
-from fastrod.solver.options import Modal, Modes
+from fastrod.solver.options import Modal, usual_modes
 from fastrod.solver.protocol import Acting, How, Last, LinearResponse, Solved
 from fastrod.solver.state import MOVING, Pose, State, check_on_robot
 from fastrod.solver.stepper import PassShapes, TimeStepper, copied
@@ -73,7 +73,7 @@ class ModalRods:
                     )
         self.options, self.robots, self.outputs, self.threads = options, robots, outputs, threads
         self.dynamics, self.n_robots = options.dynamics, n_robots
-        modes = options.modes or (Modes(4, 2) if self.dynamics else Modes(6, 4))
+        modes = options.modes or usual_modes(robots, coarse=self.dynamics)
         self.modal = ModalSolver(robots, layout, params, n_robots, threads, modes)
         self.stepper = TimeStepper(self.modal, Step(SCHEMES[options.scheme], dt, float(options.rho)))
         self.tape: Tape | None = None

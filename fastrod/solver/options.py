@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
@@ -12,6 +13,7 @@ import numpy as np
 from fastrod.checks import NOT_NEGATIVE, POSITIVE, Bound, check, check_number, named_fields
 from fastrod.errors import InputError, RobotError, nearest, shown
 from fastrod.model.robot import Robot
+from fastrod.types import Floats
 
 SchemeName: TypeAlias = Literal["bdf1", "bdf2", "generalized_alpha"]
 SolverName: TypeAlias = Literal["observer", "modal"]
@@ -68,7 +70,8 @@ class Modal:
     rho: Annotated[float, Bound(least=0.0, most=0.9, hint="Beyond it sudden loads grow.")] = 0.5
     """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
     modes: Modes | None = None
-    """Resolution of the rod; None: `Modes(6, 4)` at rest, `Modes(4, 2)` in motion."""
+    """Resolution of the rod; None: `usual_modes`, at rest `Modes(6, 4)` and in motion `Modes(4, 2)`, of
+    robots that are heavy for their stiffness more."""
 
     def __post_init__(self) -> None:
         check(self, "")
@@ -86,6 +89,34 @@ def _check_modes(modes: object) -> None:
         most = _MOST_PIECES if name == "pieces" else _MOST_MODES
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
             raise InputError(f"modes has {name}={shown(value)}; give a whole number from 1 to {most}.")
+
+
+_HEAVY = 30.0
+"""Weight in EI/L^2 of the softest segment from which robots are of modes: of rods that bear as much, one
+forward integration finds a shape that would not stay now and then, of twice as much none for some, and of
+eight times none for all."""
+
+
+def _weights(robot: Robot) -> Floats:
+    """(n_segments,) weight of each segment and what is beyond it [N]."""
+    mass = [s.line_density * s.length + sum(lump.mass for lump in s.lumps) for s in robot.segments]
+    return np.asarray(np.cumsum(mass[::-1])[::-1] * np.linalg.norm(robot.gravity))
+
+
+def usual_modes(robots: Sequence[Robot], *, coarse: bool, pieces: int = 1) -> Modes:
+    """Modes with which the tip is within some 1e-5 of the length at rest under the robot's own weight,
+    `coarse` within some 1e-4, and at least so many pieces.
+
+    A segment that bears W at its end bends within sqrt(EI/W) of it.
+    """
+    bends = max(
+        segment.length * math.sqrt(weight / min(segment.bending_stiffness))
+        for robot in robots
+        for segment, weight in zip(robot.segments, _weights(robot), strict=True)
+    )
+    if coarse and bends <= pieces:
+        return Modes(4, 2, pieces=pieces)
+    return Modes(6, 4, pieces=min(max(pieces, math.ceil(0.5 * bends)), _MOST_PIECES))
 
 
 def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:
@@ -133,8 +164,8 @@ def solver_of(
     dynamics: bool = False,
     scheme: SchemeName = Modal.scheme,
 ) -> Observer | Modal:
-    """The solver of these robots: the observer, the faster one at rest, unless they need modes. Raises
-    `InputError` for one that there is not, or that cannot do what is asked."""
+    """The solver of these robots: the observer, unless they need modes or, heavy as they are, rest better by
+    them. Raises `InputError` for one that there is not, or that cannot do what is asked."""
     if isinstance(solver, (Observer, Modal)):
         if dynamics or scheme != Modal.scheme:
             what = "dynamics" if dynamics else "scheme"
@@ -160,7 +191,12 @@ def solver_of(
     if (solver == "observer" or own) and (dynamics or soft):
         what = "dynamics=True" if dynamics else f"a robot with {soft}"
         raise InputError(f"solver is 'observer' with {what}, which needs solver='modal'.")
-    return modal if dynamics or soft or solver == "modal" else own or Observer()
+    heavy = any(
+        _weights(robot)[0] * robot.length**2 > _HEAVY * min(min(s.bending_stiffness) for s in robot.segments)
+        for robot in robots
+        if robot.segments[0].mode != "paper"
+    )
+    return modal if dynamics or soft or solver == "modal" or (heavy and not solver) else own or Observer()
 
 
 def check_fellows(solver: Observer | Modal, contact: object, feel_contact: bool, device: str) -> None:

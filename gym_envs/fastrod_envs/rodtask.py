@@ -14,7 +14,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
-from fastrod.solver.options import Observer
+from fastrod.solver.options import Observer, solver_of
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.randomisation import Randomisation
@@ -89,7 +89,9 @@ class RodTask(Task):
             outputs=self.outputs,
             threads=options.threads,
             contact=contact,
-            solver=Observer(kept_jacobian_tolerance=self.kept_jacobian_tolerance),
+            solver=Observer(kept_jacobian_tolerance=self.kept_jacobian_tolerance)
+            if isinstance(solver_of([self.base_robot]), Observer)
+            else None,
             feel_contact=feel_contact,
             device=options.device,
         )

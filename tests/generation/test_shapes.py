@@ -50,9 +50,11 @@ def inputs(table: dict[str, np.ndarray], robot: Robot) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("name", ["five_segment_reacher", "prototype", "tdcr_b"])
+@pytest.mark.parametrize("name", ["five_segment_reacher", "prototype", "tdcr_b", "prototype that stretches"])
 def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
-    robot = heavy(name)
+    robot = heavy(name.split()[0])
+    if "stretches" in name:
+        robot = replace(robot, segments=(replace(robot.segments[0], axial_stiffness=40.0),))
     table = made(robot, 320, tolerance=1e-6)
     sim = fastrod.Simulator(robot, 320, points_per_segment=6)
     state = sim.settle(**inputs(table, robot), tolerance=1e-10)

@@ -182,7 +182,7 @@ def test_gravity_off_takes_the_sag_away():
 
 def test_gravity_acts_on_lumps_too():
     robot = heavy("passive")
-    lumps = (Lump(at=0.2, mass=0.02),)
+    lumps = (Lump(at=0.2, mass=0.05),)
     robot = replace(robot, segments=(replace(robot.segments[0], lumps=lumps),))
     world, double = FreeWorld(robot), FreeWorld(replace(robot, gravity=(0.0, 0.0, -2.0 * 9.81)))
     assert_allclose(rest(world, still(world, gravity=0.0)), [0.2, 0.0, 0.0], atol=1e-8)

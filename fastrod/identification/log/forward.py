@@ -43,7 +43,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion, segment_bends
 from fastrod.solver.inputs import Inputs, Reader
-from fastrod.solver.options import Modal, Modes, solver_of
+from fastrod.solver.options import Modal, solver_of, usual_modes
 from fastrod.types import Flags, Floats, Ints, Params, Ports
 
 TOLERANCE = 1e-8  # of the robot's length: far below any camera
@@ -57,7 +57,6 @@ _SOON = 10.0  # s
 _GAP = 3.0  # times the usual time between two rows of a run
 _FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
-MODES = Modes(4, 2)  # of rods that need modes, as far off
 
 
 class PredictedPose(NamedTuple):
@@ -192,13 +191,13 @@ class PredictedRod:
         self.threads = threads
         self.samples, self.points = samples, points and samples.log.points is not None
         bare = replace(robot, effects=())
-        n = len(samples.rows)
+        n, by_modes = len(samples.rows), isinstance(solver_of([bare]), Modal)
         self._sim = Simulator(
             bare,
             n_robots=n,
             points_per_segment=N_STEPS,
             outputs="full",
-            solver=Modal(modes=MODES) if isinstance(solver_of([bare]), Modal) else None,
+            solver=Modal(modes=usual_modes([bare], coarse=True)) if by_modes else None,
             threads=threads,
         )
         # a step of first order goes by the tendons that are slack before it, and is wrong where others are

@@ -42,7 +42,7 @@ S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
 # one, fraction of it that is taken, flags, a diagonal entry of the Hessian, the tip's rotation before the
 # step, how many steps the robot took, and which tendons were slack before the step
 L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
-L_PIVOT, L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, NEWTON = 8, 9, 18, 19, 20, 21
+L_PIVOT, L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, L_FORCE, NEWTON = 8, 9, 18, 19, 20, 21, 22
 
 # host: 1 where a base gives way, 1 in the first lane where any does; displacement of the base and its Newton
 # step; inertia of its body over kappa dt^2 (6, 6), its pose without the rod, kappa, the scheme, the trace

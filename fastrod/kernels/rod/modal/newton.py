@@ -26,6 +26,7 @@ from .fields import (
     L_COUNT,
     L_DONE,
     L_ENERGY,
+    L_FORCE,
     L_REPLACED,
     L_ROTATION,
     L_SIGMA,
@@ -47,10 +48,16 @@ from .sweep import sweep_piece
 from .tendons import tendon_paths, tensions
 
 SMALLEST_SIGMA, FIRST_SIGMA, LARGEST_SIGMA = 1e-4, 0.1, 1e8
+NEUTRAL = 1e-6
+"""So little damping is none: where the Hessian is positive with it nothing holds the rod in some direction,
+as about the vertical one that hangs over to a side, and its energy does not fall."""
 LONGEST_STEP = 1.0
 """Change of a piece's bend, of one mode [rad], or of strain by a fifth of it."""
 ROUNDING = 1e-12
 """Rounding error of the energies: below it a rise is none."""
+STATIONARY, IMPERFECTION = 1e-6, 0.5
+"""Largest moment on a robot that stands still, in what bends it by a radian; and by how much one is bent that
+stands on a saddle [rad]."""
 TINY = 1e-3
 """Smallest fraction of the tolerance: after so small a step it does not matter which tendons it slackened."""
 
@@ -68,13 +75,16 @@ def sweep(b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork, w
 
 @kernel
 def add_damping(b: ModalBasis, work: ModalWork) -> None:
-    """Add sigma D to the Hessian."""
+    """Add sigma D to the Hessian; and the largest of what bends the modes, in what bends them by a radian."""
     n_modes = b.component.shape[0]
+    clear(work.newton[L_FORCE * W : (L_FORCE + 1) * W])
     for p in range(work.piece.shape[0]):
         for a in range(n_modes):
             row, gram = p * n_modes + a, 1.0 / (2.0 * b.degree[a] + 1.0)
             for w in range(W):
                 k = gram * read(work.piece[p], P_L, w) * read(work.piece[p], P_K + b.component[a], w)
+                force = abs(read(work.gradient, row, w)) * read(work.piece[p], P_L, w) / k
+                write(work.newton, L_FORCE, w, max(force, read(work.newton, L_FORCE, w)))
                 k *= read(work.newton, L_SIGMA, w)
                 write_at(hessian(work), row, row, w, at(hessian(work), row, row, w) + k)
 
@@ -108,7 +118,7 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
         replaced = read(newton, L_REPLACED, w) > 0.0
         write(newton, L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
         small = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
-        every = every and (done or (small and not replaced and read(newton, L_SIGMA, w) == 0.0))
+        every = every and (done or (small and not replaced and read(newton, L_SIGMA, w) <= NEUTRAL))
     return every
 
 
@@ -154,6 +164,19 @@ def went_slack(work: ModalWork, tolerance: float) -> bool:
     return some
 
 
+@kernel
+def disturb(b: ModalBasis, work: ModalWork, w: int) -> None:
+    """Bend a robot that rests on a saddle of the energy, as a straight rod under more than it bears: it falls
+    to a side, which symmetry would keep it from."""
+    n_pieces, n_modes = work.piece.shape[0], b.component.shape[0]
+    for p in range(n_pieces):
+        for a in range(n_modes):
+            if b.component[a] < 2 and b.degree[a] == 0:
+                bend = IMPERFECTION / (n_pieces * read(work.piece[p], P_L, w) * (1.0 + b.component[a]))
+                write(work.q, p * n_modes + a, w, read(work.q, p * n_modes + a, w) + bend)
+    write(work.newton, L_BEFORE, w, 1e300)
+
+
 @inline
 def rotation_between(after: tuple[float, ...], before: tuple[float, ...]) -> Vec:
     """Rotation vector from one rotation to another that is near, world."""
@@ -165,7 +188,7 @@ def rotation_between(after: tuple[float, ...], before: tuple[float, ...]) -> Vec
 
 
 @kernel
-def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> int:
+def accept_step(b: ModalBasis, work: ModalWork, tip: int, tolerance: float, enough: bool) -> int:
     """Keep or undo the step of every robot, and change its damping; how many are not done. A moment on the
     tip has no energy: its work along the step counts in its place.
 
@@ -180,25 +203,30 @@ def accept_step(work: ModalWork, tip: int, tolerance: float, enough: bool) -> in
         sigma, size = read(newton, L_SIGMA, w), read(newton, L_SIZE, w)
         follower = get(work.outside, 12, w)
         # the energy of a force that follows the rod is not the same after the step
-        small = size * read(newton, L_STEP, w) < 1e-6 or (sigma == 0.0 and size < tolerance)
+        small = size * read(newton, L_STEP, w) < 1e-6 or (sigma <= NEUTRAL and size < tolerance)
         followed = dot(follower, follower) > 0.0 or read(work.piece[0], P_FOLLOWED, w) > 0.0
         small = small or (size < LONGEST_STEP and (followed or read(work.host, G_ON, w) > 0.0))
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
         if read(newton, L_DONE, w) > 0.0:
             continue
-        if read(newton, L_REPLACED, w) > 0.0 or not lower:
-            write(newton, L_SIGMA, w, min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA))
+        replaced = read(newton, L_REPLACED, w) > 0.0
+        if replaced or not lower:
+            more = min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
+            write(newton, L_SIGMA, w, NEUTRAL if replaced and sigma == 0.0 else more)
             for a in range(len(work.q) // W):
                 write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
             for k in range(6 if hosted(work) else 0):
                 write(work.host, G_D + k, w, read(work.host, G_D + k, w) + read(work.host, G_STEP + k, w))
+            if replaced and sigma > 0.0 and read(newton, L_FORCE, w) < STATIONARY:
+                disturb(b, work, w)
             left += 1
             continue
         write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
         put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
-        write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0)
+        less = 0.0 if sigma > NEUTRAL else sigma
+        write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else less)
         close = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
-        if enough and sigma == 0.0 and close and read(newton, L_AGAIN, w) == 0.0:
+        if enough and sigma <= NEUTRAL and close and read(newton, L_AGAIN, w) == 0.0:
             write(newton, L_DONE, w, 1.0)
         else:
             left += 1
@@ -254,7 +282,7 @@ def minimise(
             return
         if not small:
             energy_of_shape(b, command, work, newton[L_ENERGY * W : (L_ENERGY + 1) * W])
-            if accept_step(work, tip, tolerance, enough) == 0:
+            if accept_step(b, work, tip, tolerance, enough) == 0:
                 return
         elif enough:
             for w in range(W):
