@@ -103,7 +103,7 @@ def _weights(robot: Robot) -> Floats:
     return np.asarray(np.cumsum(mass[::-1])[::-1] * np.linalg.norm(robot.gravity))
 
 
-def usual_modes(robots: Sequence[Robot], *, coarse: bool, pieces: int = 1) -> Modes:
+def usual_modes(robots: Sequence[Robot], *, coarse: bool = False, pieces: int = 1) -> Modes:
     """Modes with which the tip is within some 1e-5 of the length at rest under the robot's own weight,
     `coarse` within some 1e-4, and at least so many pieces.
 
@@ -114,8 +114,8 @@ def usual_modes(robots: Sequence[Robot], *, coarse: bool, pieces: int = 1) -> Mo
         for robot in robots
         for segment, weight in zip(robot.segments, _weights(robot), strict=True)
     )
-    if coarse and bends <= pieces:
-        return Modes(4, 2, pieces=pieces)
+    if coarse and bends <= 1.0:
+        return Modes(4, 2)
     return Modes(6, 4, pieces=min(max(pieces, math.ceil(0.5 * bends)), _MOST_PIECES))
 
 
