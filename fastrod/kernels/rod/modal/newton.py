@@ -211,13 +211,14 @@ def accept_step(b: ModalBasis, work: ModalWork, tip: int, tolerance: float, enou
             continue
         replaced = read(newton, L_REPLACED, w) > 0.0
         if replaced or not lower:
+            still = replaced and read(newton, L_FORCE, w) < STATIONARY
             more = min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
-            write(newton, L_SIGMA, w, NEUTRAL if replaced and sigma == 0.0 else more)
+            write(newton, L_SIGMA, w, NEUTRAL if still and sigma == 0.0 else more)
             for a in range(len(work.q) // W):
                 write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
             for k in range(6 if hosted(work) else 0):
                 write(work.host, G_D + k, w, read(work.host, G_D + k, w) + read(work.host, G_STEP + k, w))
-            if replaced and sigma > 0.0 and read(newton, L_FORCE, w) < STATIONARY:
+            if still and sigma > 0.0:
                 disturb(b, work, w)
             left += 1
             continue
