@@ -71,7 +71,7 @@ class Modal:
     """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
     modes: Modes | None = None
     """Resolution of the rod; None: `usual_modes`, at rest `Modes(6, 4)` and in motion `Modes(4, 2)`, of
-    robots that are heavy for their stiffness more."""
+    robots that are heavy for their stiffness more; of rods that may touch something as few."""
 
     def __post_init__(self) -> None:
         check(self, "")
@@ -103,9 +103,9 @@ def _weights(robot: Robot) -> Floats:
     return np.asarray(np.cumsum(mass[::-1])[::-1] * np.linalg.norm(robot.gravity))
 
 
-def usual_modes(robots: Sequence[Robot], *, coarse: bool = False, pieces: int = 1) -> Modes:
+def usual_modes(robots: Sequence[Robot], *, coarse: bool) -> Modes:
     """Modes with which the tip is within some 1e-5 of the length at rest under the robot's own weight,
-    `coarse` within some 1e-4, and at least so many pieces.
+    `coarse` within some 1e-4.
 
     A segment that bears W at its end bends within sqrt(EI/W) of it.
     """
@@ -116,7 +116,7 @@ def usual_modes(robots: Sequence[Robot], *, coarse: bool = False, pieces: int = 
     )
     if coarse and bends <= 1.0:
         return Modes(4, 2)
-    return Modes(6, 4, pieces=min(max(pieces, math.ceil(0.5 * bends)), _MOST_PIECES))
+    return Modes(6, 4, pieces=min(max(1, math.ceil(0.5 * bends)), _MOST_PIECES))
 
 
 def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:

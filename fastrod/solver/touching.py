@@ -32,7 +32,7 @@ from fastrod.solver.merge import merge_arrays
 from fastrod.solver.modal import Step, in_threads, no_hosts
 from fastrod.solver.modal_response import ModalLinear
 from fastrod.solver.motion import ModalRods
-from fastrod.solver.options import Modal, Modes, usual_modes
+from fastrod.solver.options import Modal, Modes
 from fastrod.solver.protocol import Acting, How, Last, Solved
 from fastrod.solver.recovery import FOLDS, tendon_bend
 from fastrod.solver.settle import unloaded
@@ -70,10 +70,9 @@ class TouchingRods(ModalRods):
         self, engine: Engine, options: Modal, robots: tuple[Robot, ...], *given: Any, **named: Any
     ) -> None:
         # a force between its ends makes a kink in the curvature of a segment
-        one = robots[0].n_segments == 1
-        usual = usual_modes(robots, pieces=1 + one)
-        if options.dynamics or not one:  # of six modes a piece some impacts have no balance
-            usual = Modes(4, 2, pieces=usual.pieces)
+        usual = Modes(4, 2)
+        if robots[0].n_segments == 1:
+            usual = Modes(4, 2, pieces=2) if options.dynamics else Modes(6, 4, pieces=2)
         options = replace(options, modes=options.modes or usual)
         super().__init__(options, robots, *given, **{**named, "outputs": "full"})
         self.engine = engine
