@@ -132,15 +132,18 @@ INPUTS: Rows = [
     (lambda: settle(LENGTHS, line_force=np.zeros((2, 5, 3, 2))), "line_force has shape"),
     (lambda: settle(LENGTHS, line_force=np.zeros((1, 1, 3))), "two or more"),
     (lambda: settle(LENGTHS, tension=[1.0] * 4), "no segment of this robot"),
+    (lambda: three().settle(REST, tolerance=HUGE), r"tolerance is 1000.* m; it must be a number"),
     (
         lambda: step(tip_force=(0.0, 0.0, 1e13)),
         r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 1\.e\+13\]\.",
     ),
+    (lambda: step(tip_force=[HUGE, 0, 0]), "tip_force is not an array of numbers"),
     (lambda: step(point_force=[(HUGE, (0, 0, 1))]), "point_force must be"),
     (lambda: reacher().restore("x"), r"^the snapshot is 'x'; give what Simulator.snapshot\(\) returned"),
     (lambda: reacher().step(dt=0.1), r"^step has no input 'dt'; the time step is given once: Simulator\("),
     (lambda: reacher().settle(tip_forc=(0, 0, 1)), "^settle has no input 'tip_forc'; did you mean"),
     (lambda: reacher().step(MASKED), "^tendon_length is a masked array that hides 1 of 15 entries"),
+    (lambda: reacher().step(HOME, tip_force=FORCE), "tip_force is a masked array"),
     (lambda: reacher().step(HOME, point_force=[(0.1, FORCE)]), "point_force is a masked array"),
     (lambda: reacher().step(HOME, point_force=[(PLACE, (0, 0, 1))]), "arclength"),
     (lambda: reacher().step(HOME, gravity=9.81), r"gravity has shape \(\); it must be"),
@@ -163,20 +166,26 @@ INPUTS: Rows = [
         lambda: SegmentActions(chain_of_thirty()).inputs(np.full(90, np.nan)),
         "action holds a value that is not finite",
     ),
+    (lambda: SegmentActions(chain_of_thirty()).inputs([HUGE] * 90), r"action is .*; give 90 numbers \[m\]\."),
 ]
 
 SIMULATORS: Rows = [
     (lambda: Simulator(rod(), n_robots=0), "n_robots is 0"),
+    (lambda: Simulator(rod(), n_robots=2.5), "whole number"),
     (lambda: Simulator(rod(), n_robots=HUGE), "take fewer"),
     (lambda: Simulator(rod(), points_per_segment=1), "at least 2"),
     (lambda: Simulator(rod(), outputs="tips"), "'full' or 'tip'"),
     (lambda: Simulator(rod(), threads=1000), "threads is 1000"),
     (lambda: Simulator(REACHER, 10**12), r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB"),
+    (lambda: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
     (lambda: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),
     (lambda: Observer(kept_jacobian_tolerance=-1e-9), "Observer.kept_jacobian_tolerance"),
     (lambda: Simulator(rod()).jacobian(), "call step or settle first"),
+    (lambda: Simulator(rod()).compliance(), "call step or settle first"),
     (lambda: Simulator(rod()).shape(0.01), "call step or settle first"),
+    (lambda: Simulator(rod()).measure(), "call step or settle first"),
     (lambda: settled(rod()).shape(0.08), r"arclength 0.08 m; robot 0 runs from 0 to 0.07"),
+    (lambda: settled(rod()).shape(HUGE), r"arclength is 1000.*; give numbers"),
     (
         lambda: settled(rod(), outputs="tip").shape(0.01),
         r"shape needs Simulator\(..., outputs='full'\); this one keeps the tip only",
@@ -188,6 +197,10 @@ SIMULATORS: Rows = [
     (
         lambda: Simulator(rod_with("creep", share=0.1), 3).restore(settled(rod(), 3).snapshot()),
         "another simulator; its effects differ",
+    ),
+    (
+        lambda: Simulator(rod_with("creep")).restore(Simulator(rod_with("backlash")).snapshot()),
+        "another simulator",
     ),
     (
         lambda: settled(rod(), 3).replace([0, 1], [rod()]),
@@ -233,6 +246,10 @@ MOTION: Rows = [
         lambda: Simulator(rod(axial_stiffness=9.0), solver="observer"),
         "^solver is 'observer' with a robot with axial_stiffness",
     ),
+    (
+        lambda: Simulator(rod(lumps=(Lump(at=0.01, mass=0.1),)), solver="observer"),
+        "^solver is 'observer' with a robot with lumps",
+    ),
     (lambda: moving(scheme="bdf3"), "^scheme is 'bdf3'; did you mean 'bdf2'"),
     (lambda: Modal(dynamics=True, rho=1), "^rho is 1; it must be a number from 0 to 0.9. Beyond it"),
     (lambda: moving(dt=0.0), "^dt is 0.0 s; it must be a number, positive and finite"),
@@ -251,6 +268,7 @@ MOTION: Rows = [
         "no input 'modes'; it is one of the solver: solver=fastrod.Modal",
     ),
     (lambda: moving(solver=Observer()), "^dynamics was given beside a solver; give solver=fastrod.Modal"),
+    (lambda: moving(solver=Modal(), dynamics=False, scheme="bdf2"), "^scheme was given beside a solver"),
     *(
         (lambda n=n: moving().step(REST, passes=n), f"^passes is {n!r}; give a whole number from 1 to 100")
         for n in (0, 101, 1.5, "two")
@@ -295,12 +313,14 @@ ROBOTS: Rows = [
     (lambda: rod(bending_stiffness=(1e-300, 1.0)), r"1e-300 N m\^2; it must be between 1e-20 and 1e\+15"),
     (lambda: Lump(at=0.01, mass=-0.1), "^Lump.mass is -0.1 kg; it must be zero or positive"),
     (lambda: loads(A + "lumps = [{at = 0.01, mas = 0.1}]\n" + TENDON + "}]"), "did you mean 'mass'"),
+    (lambda: loads(A + "lumps = [{at = 0.01}]\n" + TENDON + "}]"), "mass"),
     (lambda: loads(A + "damping_tme = 0.1\n" + TENDON + "}]"), "did you mean 'damping_time'"),
     (lambda: loads('name = "a"'), "no segments"),
     (lambda: loads(SEGMENT + 'mode = "passive"'), "no name"),
     (lambda: loads('name = "a"\nlenght = 3\n'), "unknown key 'lenght'"),
     (lambda: loads(A.replace("length", "lenght")), "did you mean 'length'"),
     (lambda: loads(A.replace("0.07", "70")), "Was it given in mm"),
+    (lambda: loads(A.replace("0.07", "-0.07")), "must be positive"),
     (lambda: loads(A.replace("0.07", '"long"')), "length: Expected 'float'"),
     (lambda: loads(A + 'mode = "tendon_lenght"'), "tendon_length"),
     (lambda: loads(A + TENDON + ", colour = 1}]"), "unknown key 'colour'"),

@@ -71,7 +71,7 @@ class Modal:
     """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
     modes: Modes | None = None
     """Resolution of the rod; None: `usual_modes`, at rest `Modes(6, 4)` and in motion `Modes(4, 2)`, of
-    robots that are heavy for their stiffness more; of rods that may touch something as few."""
+    robots that are heavy for their stiffness more, except in a contact scene."""
 
     def __post_init__(self) -> None:
         check(self, "")
@@ -104,8 +104,8 @@ def _weights(robot: Robot) -> Floats:
 
 
 def usual_modes(robots: Sequence[Robot], *, coarse: bool) -> Modes:
-    """Modes with which the tip is within some 1e-5 of the length at rest under the robot's own weight,
-    `coarse` within some 1e-4.
+    """Modes with which the tip of most robots is within 1e-5 of the length at rest under their own weight,
+    and within 1e-4 `coarse`; upright ones beyond some 250 EI/L^2 may be further off.
 
     A segment that bears W at its end bends within sqrt(EI/W) of it.
     """

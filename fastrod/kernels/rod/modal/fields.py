@@ -40,7 +40,8 @@ C_TH, C_V, COLUMN = 0, 3, 6
 S_MASS, S_F, S_HISTORY, S_GIVEN, S_POS, S_ROW = 0, 1, 4, 7, 10, 13
 # Newton: energies of the trial and before it, damping, size [rad] of the step at work and of the robot's last
 # one, fraction of it that is taken, flags, a diagonal entry of the Hessian, the tip's rotation before the
-# step, how many steps the robot took, and which tendons were slack before the step
+# step, how many steps the robot took, which tendons were slack before the step, and the largest moment on a
+# mode, in what bends it by a radian
 L_ENERGY, L_BEFORE, L_SIGMA, L_SIZE, L_CORRECTION, L_STEP, L_DONE, L_REPLACED = 0, 1, 2, 3, 4, 5, 6, 7
 L_PIVOT, L_ROTATION, L_COUNT, L_SLACK, L_AGAIN, L_FORCE, NEWTON = 8, 9, 18, 19, 20, 21, 22
 
