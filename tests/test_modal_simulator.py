@@ -301,3 +301,13 @@ def test_an_upright_rod_falls_to_a_side_beyond_what_it_bears(weight: float) -> N
     heights = [sim.settle().tip_position[0, 2] for sim in (rest, pushed)]
     assert_allclose(*heights, atol=1e-5)
     assert (heights[0] < 0.4 - 1e-4) == (weight > 7.837)
+
+
+@pytest.mark.parametrize(("n_tendons", "weight"), [(3, 20.0), (3, 60.0), (4, 20.0), (4, 60.0)])
+def test_an_upright_rod_that_hardly_anything_holds_comes_to_rest(n_tendons: int, weight: float) -> None:
+    # round the vertical it is held by its tendons alone, or hardly
+    given = {"length": 0.4, "line_density": weight * 0.0022 / 0.4**3 / 9.81}
+    alone, tip = (rod(n_tendons=n_tendons, **some).segments for some in (given, {}))
+    for segments in (alone, rod("passive", **given).segments + tip):
+        robot = Robot(name="upright", segments=segments)
+        assert Simulator(robot, solver="modal").settle(robot.rest_tendon_length).ok.all()

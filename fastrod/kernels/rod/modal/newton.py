@@ -48,16 +48,19 @@ from .sweep import sweep_piece
 from .tendons import tendon_paths, tensions
 
 SMALLEST_SIGMA, FIRST_SIGMA, LARGEST_SIGMA = 1e-4, 0.1, 1e8
-NEUTRAL = 1e-6
-"""So little damping is none: where the Hessian is positive with it nothing holds the rod in some direction,
-as about the vertical one that hangs over to a side, and its energy does not fall."""
+NEUTRAL, LEAST_NEUTRAL = 1e-3, 5e-4
+"""So little damping is none: where the Hessian is positive with it hardly anything holds the rod in some
+direction, as about the vertical one that hangs over to a side. It falls by a tenth in each step: when it is
+the least, what holds the rod has brought it to rest."""
 LONGEST_STEP = 1.0
 """Change of a piece's bend, of one mode [rad], or of strain by a fifth of it."""
 ROUNDING = 1e-12
 """Rounding error of the energies: below it a rise is none."""
-STATIONARY, IMPERFECTION = 1e-6, 0.5
-"""Largest moment on a robot that stands still, in what bends it by a radian; and by how much one is bent that
-stands on a saddle [rad]."""
+NEARLY, STATIONARY, UNHELD = 1e-4, 1e-6, 1e-5
+"""Largest moment, in what bends the robot by a radian: on one that may have a neutral direction; on one that
+stands still; and on one at rest but for that direction."""
+IMPERFECTION = 0.5
+"""By how much a robot is bent, and twisted, that stands on a saddle [rad]."""
 TINY = 1e-3
 """Smallest fraction of the tolerance: after so small a step it does not matter which tendons it slackened."""
 
@@ -89,6 +92,26 @@ def add_damping(b: ModalBasis, work: ModalWork) -> None:
                 write_at(hessian(work), row, row, w, at(hessian(work), row, row, w) + k)
 
 
+@inline
+def undamped(sigma: float) -> bool:
+    """Whether this damping is none."""
+    return sigma == 0.0 or LEAST_NEUTRAL <= sigma <= NEUTRAL
+
+
+@inline
+def drifts(work: ModalWork, w: int) -> bool:
+    """Whether the Newton step is one along what nothing holds."""
+    free = read(work.newton, L_FORCE, w) < UNHELD and read(work.host, G_ON, w) == 0.0
+    return free and read(work.newton, L_SIGMA, w) == LEAST_NEUTRAL
+
+
+@inline
+def rests(work: ModalWork, w: int, tolerance: float) -> bool:
+    """Whether the Newton step was undamped, and smaller than `tolerance` [rad] or one that drifts."""
+    small = read(work.newton, L_SIZE, w) * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
+    return undamped(read(work.newton, L_SIGMA, w)) and (small or drifts(work, w))
+
+
 @kernel
 def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
     """Size [rad] of the Newton step in `work.gradient`, and the fraction of it that is taken: no longer than
@@ -111,14 +134,13 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
     for w in range(W):
         size, done = read(newton, L_SIZE, w), read(newton, L_DONE, w) > 0.0
         if not done:
-            write(newton, L_CORRECTION, w, size)
+            write(newton, L_CORRECTION, w, read(newton, L_FORCE, w) if drifts(work, w) else size)
             write(newton, L_COUNT, w, read(newton, L_COUNT, w) + 1.0)
         if not size < 1e300:  # also where it is no number
             write(newton, L_REPLACED, w, 1.0)
         replaced = read(newton, L_REPLACED, w) > 0.0
         write(newton, L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
-        small = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
-        every = every and (done or (small and not replaced and read(newton, L_SIGMA, w) <= NEUTRAL))
+        every = every and (done or (not replaced and rests(work, w, tolerance)))
     return every
 
 
@@ -171,7 +193,7 @@ def disturb(b: ModalBasis, work: ModalWork, w: int) -> None:
     n_pieces, n_modes = work.piece.shape[0], b.component.shape[0]
     for p in range(n_pieces):
         for a in range(n_modes):
-            if b.component[a] < 2 and b.degree[a] == 0:
+            if b.component[a] < 3 and b.degree[a] == 0:
                 bend = IMPERFECTION / (n_pieces * read(work.piece[p], P_L, w) * (1.0 + b.component[a]))
                 write(work.q, p * n_modes + a, w, read(work.q, p * n_modes + a, w) + bend)
     write(work.newton, L_BEFORE, w, 1e300)
@@ -203,7 +225,7 @@ def accept_step(b: ModalBasis, work: ModalWork, tip: int, tolerance: float, enou
         sigma, size = read(newton, L_SIGMA, w), read(newton, L_SIZE, w)
         follower = get(work.outside, 12, w)
         # the energy of a force that follows the rod is not the same after the step
-        small = size * read(newton, L_STEP, w) < 1e-6 or (sigma <= NEUTRAL and size < tolerance)
+        small = size * read(newton, L_STEP, w) < 1e-6 or (undamped(sigma) and size < tolerance)
         followed = dot(follower, follower) > 0.0 or read(work.piece[0], P_FOLLOWED, w) > 0.0
         small = small or (size < LONGEST_STEP and (followed or read(work.host, G_ON, w) > 0.0))
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
@@ -211,23 +233,23 @@ def accept_step(b: ModalBasis, work: ModalWork, tip: int, tolerance: float, enou
             continue
         replaced = read(newton, L_REPLACED, w) > 0.0
         if replaced or not lower:
-            still = replaced and read(newton, L_FORCE, w) < STATIONARY
-            more = min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
-            write(newton, L_SIGMA, w, NEUTRAL if still and sigma == 0.0 else more)
+            force, more = read(newton, L_FORCE, w), min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
+            write(newton, L_SIGMA, w, NEUTRAL if sigma < LEAST_NEUTRAL and force < NEARLY else more)
             for a in range(len(work.q) // W):
                 write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
             for k in range(6 if hosted(work) else 0):
                 write(work.host, G_D + k, w, read(work.host, G_D + k, w) + read(work.host, G_STEP + k, w))
-            if still and sigma > 0.0:
+            if replaced and sigma >= LEAST_NEUTRAL and force < STATIONARY:
                 disturb(b, work, w)
             left += 1
             continue
+        close = rests(work, w, tolerance)
         write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
         put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
-        less = 0.0 if sigma > NEUTRAL else sigma
-        write(newton, L_SIGMA, w, 0.125 * sigma if sigma > SMALLEST_SIGMA else less)
-        close = size * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
-        if enough and sigma <= NEUTRAL and close and read(newton, L_AGAIN, w) == 0.0:
+        less = 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0
+        neutral = undamped(sigma) and sigma > 0.0
+        write(newton, L_SIGMA, w, max(0.9 * sigma, LEAST_NEUTRAL) if neutral else less)
+        if enough and close and read(newton, L_AGAIN, w) == 0.0:
             write(newton, L_DONE, w, 1.0)
         else:
             left += 1
