@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,16 @@ def test_the_first_displacement_bends_toward_d1_and_the_second_toward_d2(entry: 
     assert tip[axis] == pytest.approx(0.1 / 0.5 * (1.0 - np.cos(0.5)), abs=1e-6)
     assert abs(tip[1 - axis]) < 1e-9
     assert tip[2] == pytest.approx(0.1 / 0.5 * np.sin(0.5), abs=1e-6)
+
+
+def test_a_passive_segment_takes_a_share_of_the_bend_of_the_tendons_that_cross_it() -> None:
+    driven = stiff_wires(1).segments[0]
+    robot = Robot(name="catheter", segments=(replace(driven, mode="passive", tendons=()), driven))
+    actions = SegmentActions(robot)
+    assert actions.offset.tolist() == [0.0, 0.008]
+    state = Simulator(robot).settle(**actions.inputs([0.0, 9.0, 9.0, 0.0, 0.3 * 0.008, 0.4 * 0.008]))
+    assert state.tip_rotation[0, 2, 2] == pytest.approx(np.cos(0.5), abs=1e-6)
+    assert state.position[0, 20, 0] / state.tip_position[0, 0] == pytest.approx(0.26, abs=0.01)
 
 
 def test_the_matrix_is_the_slope_of_the_inputs() -> None:

@@ -166,8 +166,8 @@ def plan(
 
 @final
 class _Drive:
-    """The coordinates of a robot that are free: two displacements of each segment, and the extension of those
-    that extend."""
+    """The coordinates of a robot that are free: two displacements of each segment that is driven, and the
+    extension of those that extend."""
 
     def __init__(self, robot: Robot, limit: float | None) -> None:
         self.robot = robot
@@ -175,7 +175,7 @@ class _Drive:
         ranges: list[tuple[float, float]] = []
         bend: list[float] = []
         for segment, offset in zip(robot.segments, actions.offset, strict=True):
-            most = _MOST * float(offset) if limit is None else float(limit)
+            most = _MOST * float(offset) if limit is None or not offset else float(limit)
             ranges += [segment.extension, (-most, most), (-most, most)]
             bend += [float(offset)] * 3
         self._limit = np.array(ranges)

@@ -29,7 +29,8 @@ class SegmentActions:
     A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second
     toward +d2. The tendons of distal segments follow the bends and extensions of the segments that they
     cross, so every segment has its own action. Without load and with tendons that do not stretch, the
-    segments are arcs of these bends.
+    segments are arcs of these bends. A passive segment among driven ones has no displacements: its two
+    numbers do nothing, and it takes a share of the bend of the tendons that cross it.
 
     >>> import fastrod
     >>> actions = SegmentActions(fastrod.load_robot("prototype"))
@@ -39,12 +40,14 @@ class SegmentActions:
 
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
         """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first tendon
-        from the backbone. Raises `RobotError` where a segment is not driven by the lengths of two or more
-        tendons around it."""
+        from the backbone. Raises `RobotError` where a segment that is not passive, or all of them, are
+        not driven by the lengths of two or more tendons around them."""
         routing = route(robot)
         n = robot.n_segments
-        offsets = np.full(n, offset, float) if offset else np.zeros(n)
+        offsets, some_driven = np.zeros(n), any(segment.tendons for segment in robot.segments)
         for k, segment in enumerate(robot.segments):
+            if segment.mode == "passive" and some_driven:
+                continue
             if segment.mode not in ("tendon_length", "paper"):
                 raise RobotError(
                     f"segment {k + 1} of robot {robot.name!r} is {segment.mode}; an action "
@@ -56,13 +59,13 @@ class SegmentActions:
                     f"the tendons of segment {k + 1} of robot {robot.name!r} bend it in one "
                     "plane; an action needs two."
                 )
-            offsets[k] = offsets[k] or np.hypot(*arms[0])
+            offsets[k] = offset or np.hypot(*arms[0])
         bends = np.zeros((n, 2, 3 * n))  # about d1 and d2, by the action
-        for k in range(n):
+        for k in map(int, np.flatnonzero(offsets)):
             bends[k, 1, 3 * k + 1], bends[k, 0, 3 * k + 2] = 1.0 / offsets[k], -1.0 / offsets[k]
         self.robot = robot
         self.offset: Floats = offsets
-        """(n_segments,) displacement per bend [m/rad]."""
+        """(n_segments,) displacement per bend, 0 of a passive segment [m/rad]."""
         self.by_extension: Floats = np.zeros((n, 3 * n))
         """(n_segments, 3 n_segments) d(extension)/d(action)."""
         self.by_extension[np.arange(n), 3 * np.arange(n)] = 1.0

@@ -241,6 +241,14 @@ def test_reach_with_a_robot_file_is_a_gymnasium_environment(tmp_path: Path) -> N
     assert len({tuple(env.reset(seed=s, options={"difficulty": 1.0})[0][:3]) for s in range(4)}) == 4
 
 
+def test_reach_drives_the_segments_that_are_not_passive(tmp_path: Path) -> None:
+    tip = fastrod.load_robot("tdcr_b").segments[0]
+    robot = fastrod.Robot(name="catheter", segments=(replace(tip, mode="passive", tendons=()), tip))
+    fastrod.save_robot(robot, tmp_path / "catheter.toml")
+    env = BatchEnv("Reach", 2, robot=tmp_path / "catheter.toml")
+    assert env.task.driven.tolist() == [4, 5]
+
+
 @pytest.mark.parametrize(
     ("robot", "sentence"),
     [

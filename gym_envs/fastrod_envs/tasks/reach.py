@@ -225,8 +225,8 @@ def drives_of(robot: Robot) -> tuple[Ints, Floats, Floats]:
     for k, segment in enumerate(robot.segments):
         if segment.extension[0] < segment.extension[1]:
             driven, limit = [*driven, 3 * k], [*limit, segment.extension]
-        bend = BEND * float(offset[k])
-        driven, limit = [*driven, 3 * k + 1, 3 * k + 2], [*limit, (-bend, bend), (-bend, bend)]
+        if (bend := BEND * float(offset[k])) > 0.0:
+            driven, limit = [*driven, 3 * k + 1, 3 * k + 2], [*limit, (-bend, bend), (-bend, bend)]
     rate = [0.8 * (high - low) if j % 3 == 0 else high for j, (low, high) in zip(driven, limit, strict=True)]
     return np.array(driven), np.array(limit), np.array(rate)
 

@@ -38,7 +38,7 @@ class ControlPanel:
     ) -> None:
         """`may` says of an event whether the page it comes from may act."""
         self.server, self.session, self.teleop, self._may = server, session, session.teleop, may
-        self.chosen = 0
+        self.chosen = next(iter(self.teleop.driven), 0)
         """Segment that keys bend."""
         self._followers: list[tuple[Any, Callable[[], Any]]] = []
         self._commands: list[Any] = []
@@ -194,7 +194,7 @@ class ControlPanel:
             ("-y", "K", 1, -1),
         ):
             self._key(f"Bend toward {name}", key, partial(self._bend, axis, sign))
-        for k in range(min(session.world.robot.n_segments, 9)):
+        for k in self.teleop.driven[:9]:
             self._key(f"Keys bend segment {k + 1}", str(k + 1), partial(setattr, self, "chosen", k))
 
     def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:

@@ -71,10 +71,11 @@ def drive_controls(world: World, teleop: Teleop) -> list[Group]:
     """Return groups for bends and extensions, tendons, and base: those that the robot has."""
     robot, groups = world.robot, []
     n = robot.n_segments
+    if len(teleop.driven) > 1:
+        groups.append(Group("", tuple(_all_bend(teleop, axis) for axis in (0, 1))))
     if teleop.actions is not None:
-        if n > 1:
-            groups.append(Group("", tuple(_all_bend(teleop, n, axis) for axis in (0, 1))))
-        groups += [Group(f"Segment {k + 1}", _segment(robot, teleop, k), n <= 2) for k in range(n)]
+        own = ((k, _segment(robot, teleop, k)) for k in range(n))
+        groups += [Group(f"Segment {k + 1}", controls, n <= 2) for k, controls in own if controls]
     if robot.n_tendons:
         groups.append(
             Group(
@@ -114,12 +115,12 @@ def load_controls(robot: Robot, teleop: Teleop, *, rings: bool = False) -> Group
     return Group("", (*(_force(teleop, axis, most) for axis in range(3)), payload, gravity))
 
 
-def _all_bend(teleop: Teleop, n: int, axis: int) -> Control:
+def _all_bend(teleop: Teleop, axis: int) -> Control:
     def get() -> float:
-        return float(np.mean([teleop.bent(k)[axis] for k in range(n)])) / _DEGREE
+        return float(np.mean([teleop.bent(k)[axis] for k in teleop.driven])) / _DEGREE
 
     def put(degrees: float) -> None:
-        for k in range(n):
+        for k in teleop.driven:
             _bend(teleop, k, axis, degrees)
 
     name = "xy"[axis]
@@ -128,7 +129,8 @@ def _all_bend(teleop: Teleop, n: int, axis: int) -> Control:
 
 
 def _segment(robot: Robot, teleop: Teleop, k: int) -> tuple[Control, ...]:
-    most = min(LARGEST_BEND / _DEGREE, _whole(teleop.limits.displacement, _arm(teleop, k) * _DEGREE))
+    step = _arm(teleop, k) * _DEGREE
+    most = min(LARGEST_BEND / _DEGREE, _whole(teleop.limits.displacement, step)) if step else 0.0
     bends = tuple(
         Control(
             label=f"Bend {name} [°]",
@@ -139,7 +141,7 @@ def _segment(robot: Robot, teleop: Teleop, k: int) -> tuple[Control, ...]:
             get=lambda axis=axis: teleop.bent(k)[axis] / _DEGREE,  # type: ignore[misc]
             put=lambda v, axis=axis: _bend(teleop, k, axis, v),  # type: ignore[misc]
         )
-        for axis, name in enumerate("xy")
+        for axis, name in enumerate("xy" if k in teleop.driven else "")
     )
     low, high = (v / _MM for v in robot.segments[k].extension)
     if high <= low:

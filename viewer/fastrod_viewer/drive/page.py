@@ -237,8 +237,8 @@ class DrivePage(ViewerPage):
         keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
         if self._can_drag() and self.teleop.actions is not None:
             keys = "<kbd>J</kbd> <kbd>L</kbd> <kbd>I</kbd> <kbd>K</kbd> bend · " + keys
-            if (n := min(self.world.robot.n_segments, 9)) > 1:
-                keys += f" · <kbd>1</kbd>–<kbd>{n}</kbd> segment that keys bend"
+            if len(driven := self.teleop.driven[:9]) > 1:
+                keys += f" · <kbd>{driven[0] + 1}</kbd>–<kbd>{driven[-1] + 1}</kbd> segment that keys bend"
         return f"<small>{keys}</small>"
 
     def _hint(self) -> str:

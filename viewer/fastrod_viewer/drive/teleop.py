@@ -156,6 +156,11 @@ class Teleop:
         with self._lock:
             return self._change(self._goals)
 
+    @property
+    def driven(self) -> list[int]:
+        """Segments that bends drive, from 0, base first."""
+        return [] if self.actions is None else np.flatnonzero(self.actions.offset).tolist()
+
     def bend(self, segment: int, toward_x: float, toward_y: float) -> None:
         """Bend a segment (from 0, base first) toward x and y of its base [rad], within `LARGEST_BEND`."""
         if self.actions is None:
@@ -165,7 +170,7 @@ class Teleop:
 
     def bent(self, segment: int) -> tuple[float, float]:
         """Bends of a segment at the goal, toward x and y of its base [rad]."""
-        if self.actions is None:
+        if self.actions is None or not self.actions.offset[segment]:
             return 0.0, 0.0
         x, y = self.goals.action[3 * segment + 1 : 3 * segment + 3] / self.actions.offset[segment]
         return float(x), float(y)
@@ -327,7 +332,7 @@ class Teleop:
 
     def _action_rates(self, actions: SegmentActions, speeds: Speeds) -> Floats:
         """(3 n_segments,) [m/s]"""
-        rates = np.repeat(speeds.bend * actions.offset, 3)
+        rates = speeds.bend * _per_bend(actions)
         rates[::3] = speeds.extension * np.maximum((self._upper - self._lower)[::3], 1e-9)
         return rates
 
@@ -354,7 +359,7 @@ class Teleop:
         """Drag law of the host's joints and the actions. A drag may pull anywhere: a robot at its limits
         follows partly."""
         width = self._upper - self._lower
-        cost = np.concatenate([np.full(n_joints, JOINT_COST), 1.0 / np.repeat(actions.offset, 3) ** 2])
+        cost = np.concatenate([np.full(n_joints, JOINT_COST), 1.0 / _per_bend(actions) ** 2])
         cost[n_joints::3] = 1.0 / np.maximum(width[::3], 1e-3) ** 2
         free = np.full(n_joints, np.inf)
         return ResolvedRate(
@@ -393,6 +398,11 @@ def _arm(robot: Robot) -> float:
         (math.hypot(*t.position(k + 1)[k]) for k, s in enumerate(robot.segments) for t in s.tendons),
         default=0.0,
     )
+
+
+def _per_bend(actions: SegmentActions) -> Floats:
+    """(3 n_segments,) displacement of a radian; the largest for a passive segment, which stays at 0 [m]."""
+    return np.repeat(np.where(actions.offset > 0.0, actions.offset, actions.offset.max()), 3)
 
 
 def _limits(robot: Robot, actions: SegmentActions | None, limits: TendonLimits) -> tuple[Floats, Floats]:

@@ -30,8 +30,13 @@ def about(robot: Robot) -> str:
     'One segment, 0.07 m, driven by the lengths of its tendons.'
     """
     n = robot.n_segments
-    modes = dict.fromkeys(segment.mode for segment in robot.segments)
-    how = " and ".join(_DRIVES[mode] for mode in modes)
+    modes = [segment.mode for segment in robot.segments]
+    passive = [str(k + 1) for k, mode in enumerate(modes) if mode == "passive"]
+    how = " and ".join(
+        _DRIVES[mode] for mode in dict.fromkeys(modes) if mode != "passive" or len(passive) == n
+    )
+    if 0 < len(passive) < n:
+        how += f", of which segment {' and '.join(passive)} has none"
     return (
         f"{'One segment' if n == 1 else f'{n} segments'}, {robot.length:g} "
         f"m{' in all' if n > 1 else ''}, {how}."
