@@ -127,6 +127,12 @@ def test_any_format_reads_as_the_same_log(name: str, suffix: str, tmp_path: Path
     assert_allclose(read_log(tmp_path / "run.csv", robot).dl, log.dl, atol=1e-9)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_a_spreadsheet_is_read_in_the_encoding_that_it_has(encoding: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t;Länge\n0;1,5\n", encoding)
+    assert read_table(tmp_path / "a.csv") == {"t": ("0",), "Länge": ("1.5",)}
+
+
 def test_matrices_and_structs_of_matlab_become_columns(tmp_path: Path) -> None:
     savemat(
         tmp_path / "a.mat", {"q": np.ones((9, 2)), "cam": {"xyz": np.ones((3, 9))}, "fs": 3.0, "who": "me"}
@@ -240,6 +246,9 @@ def test_three_commands_from_a_file_of_ones_own(
     assert "times as closely with the dl_ columns in the order 3, 5, 2, 6, 1, 4" in capsys.readouterr().err
     assert main(["check", "a.csv", "--robot", "mine.toml", "--out", "found.toml"]) == 0
     assert re.search(r"2 +4 +motorF_deg +pulls +60", capsys.readouterr().out)
+    raw(log, tmp_path / "dated.csv", replace(theirs, units=theirs.units | {"time": "iso"}))
+    assert main(["new", "dated.toml", "--log", "dated.csv", *words.split()]) == 0
+    assert load_robot("dated.toml").log.units["time"] == "iso"
     assert main(["import", "a.csv", "--robot", "found.toml", "--out", "run.csv"]) == 0
     assert_allclose(read_log("run.csv", load_robot("found.toml")).dl, log.dl, atol=1e-8)
     assert main(["check", "run.csv", "--robot", "found.toml"]) == 0

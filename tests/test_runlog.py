@@ -180,7 +180,7 @@ def test_unreadable_files(tmp_path):
     with pytest.raises(LogError, match="cannot be read: No such file or directory"):
         read_log(tmp_path / "none.csv", ROBOT)
     binary = tmp_path / "binary.csv"
-    binary.write_bytes(b"\xff\xfe\x00\x80" * 20)
+    binary.write_bytes(b"\x7f\x00\xfe\x80" * 20)
     with pytest.raises(LogError, match="cannot be read: it is not text"):
         read_log(binary, ROBOT)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import InputError, LogError, nearest
-from fastrod.logs.table import Table, read_table
+from fastrod.logs.table import DATE, Table, read_table
 from fastrod.model.logformat import UNITS
 from fastrod.model.robotfile import loads
 
@@ -411,7 +411,10 @@ def _log_text(table: Table, answers: Mapping[str, str | None], given: dict[str, 
     units = {}
     for question, key in zip(_FILE[:3], ("time-column", "tip-columns", "motor-columns"), strict=True):
         said = _UNIT.search(names[key][0])
-        unit = _spelt(said[1]) if said else _by_size(question.name, table, names[key], given)
+        unit = _spelt(said[1]) if said else ""
+        if DATE.match(str(next(iter(table[names[key][0]]), ""))):
+            unit = "iso"
+        unit = unit or _by_size(question.name, table, names[key], given)
         units[question.name] = _answer(question, answers, ask, unit)
     angular, forces = units["motor-unit"] in UNITS["angle"], given["drive"] == "force"
     if forces != (units["motor-unit"] in UNITS["force"]):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
+import re
 from collections.abc import Sequence
 from importlib import import_module
 from itertools import chain
@@ -21,6 +23,8 @@ Table: TypeAlias = dict[str, Sequence[str] | Floats]
 
 # of a Parquet file unpacked: 1.5 GB at its peak; the bytes of a CSV, too
 _MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000
+DATE = re.compile(r"\d{4}-\d\d-\d\d")
+"""Beginning of a date."""
 
 
 def read_table(path: str | Path) -> Table:
@@ -71,11 +75,10 @@ def numbers(table: Table, name: str, where: str) -> Floats:
 def _read_csv(path: Path) -> Table:
     if (size := path.stat().st_size) > _MOST_BYTES:
         raise LogError(f"{path.name} has {size} bytes; a log may have {_MOST_BYTES}. Cut it in parts.")
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = (line for line in file if not line.startswith("#"))
-        first = next((line for line in lines if line.strip()), "")
-        delimiter = max(",;\t", key=first.count)
-        rows = [row for row in csv.reader(chain([first], lines), delimiter=delimiter) if row]
+    lines = (line for line in io.StringIO(_decoded(path.read_bytes()), newline="") if line[0] != "#")
+    first = next((line for line in lines if line.strip()), "")
+    delimiter = max(",;\t", key=first.count)
+    rows = [row for row in csv.reader(chain([first], lines), delimiter=delimiter) if row]
     if delimiter == ";":  # of a spreadsheet where a comma is the decimal point
         rows[1:] = [[cell.replace(",", ".") for cell in row] for row in rows[1:]]
     if not rows:
@@ -92,6 +95,18 @@ def _read_csv(path: Path) -> Table:
     return dict(
         zip(header, zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(header), strict=True)
     )
+
+
+def _decoded(content: bytes) -> str:
+    """UTF-8, or what a spreadsheet writes: UTF-16 with its mark, or the letters of Windows."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if b"\0" in content:
+            raise
+        return content.decode("cp1252")
 
 
 def _check_header(header: list[str], where: str) -> None:
@@ -184,9 +199,10 @@ def _number(cell: str, row: int, name: str, where: str) -> float:
     try:
         return float(cell.strip() or "nan")
     except ValueError:
+        dated = ", or for dates [log] of the robot file says units.time = 'iso'" if DATE.match(cell) else ""
         raise LogError(
             f"{where} row {row}, column {name} is {cell!r}; it must be a number, or empty where "
-            "it is missing."
+            f"it is missing{dated}."
         ) from None
 
 
