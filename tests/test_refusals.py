@@ -392,10 +392,6 @@ ROBOTS: Rows = [
         lambda: SegmentActions(stiff("tendon_tension")),
         r"^segment 1 of robot 'stiff' is tendon_tension; an action needs tendons driven by length\.$",
     ),
-    (
-        lambda: SegmentActions(replace(rod(n_tendons=2), name="flat")),
-        "^the tendons of segment 1 of robot 'flat' bend it in one plane; an action needs two\\.$",
-    ),
 ]
 
 NAMES: Rows = [

@@ -174,9 +174,11 @@ class _Drive:
         actions = SegmentActions(robot)
         ranges: list[tuple[float, float]] = []
         bend: list[float] = []
-        for segment, offset in zip(robot.segments, actions.offset, strict=True):
-            most = _MOST * float(offset) if limit is None or not offset else float(limit)
-            ranges += [segment.extension, (-most, most), (-most, most)]
+        for segment, offset, bends in zip(
+            robot.segments, actions.offset, actions.bends.reshape(-1, 3), strict=True
+        ):
+            most = _MOST * float(offset) if limit is None else float(limit)
+            ranges += [segment.extension, *((-most * some, most * some) for some in bends[1:])]
             bend += [float(offset)] * 3
         self._limit = np.array(ranges)
         free = self._limit[:, 0] < self._limit[:, 1]

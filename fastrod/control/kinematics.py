@@ -213,7 +213,7 @@ class SoftTip:
         low, high = (np.empty((len(self.actions.offset), 3)) for _ in range(2))
         for k, segment in enumerate(self.actions.robot.segments):
             low[k, 0], high[k, 0] = segment.extension
-        high[:, 1:] = largest_bend * self.actions.offset[:, None]
+        high[:, 1:] = largest_bend * self.actions.offset[:, None] * self.actions.bends.reshape(-1, 3)[:, 1:]
         low[:, 1:] = -high[:, 1:]
         return low.ravel(), high.ravel()
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
-from fastrod.types import Floats
+from fastrod.types import Flags, Floats
 
 
 class TendonInputs(TypedDict):
@@ -29,8 +29,9 @@ class SegmentActions:
     A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second
     toward +d2. The tendons of distal segments follow the bends and extensions of the segments that they
     cross, so every segment has its own action. Without load and with tendons that do not stretch, the
-    segments are arcs of these bends. A passive segment among driven ones has no displacements: its two
-    numbers do nothing, and it takes a share of the bend of the tendons that cross it.
+    segments are arcs of these bends. A segment whose tendons lie in one plane bends in it, by the
+    displacement that is nearer to it; the other does nothing. Those of a passive segment among driven ones do
+    nothing, and it takes a share of the bend of the tendons that cross it.
 
     >>> import fastrod
     >>> actions = SegmentActions(fastrod.load_robot("prototype"))
@@ -41,10 +42,11 @@ class SegmentActions:
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
         """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first tendon
         from the backbone. Raises `RobotError` where a segment that is not passive, or all of them, are
-        not driven by the lengths of two or more tendons around them."""
+        not driven by the lengths of tendons."""
         routing = route(robot)
         n = robot.n_segments
         offsets, some_driven = np.zeros(n), any(segment.tendons for segment in robot.segments)
+        bends = np.zeros((n, 2, 3 * n))  # about d1 and d2, by the action
         for k, segment in enumerate(robot.segments):
             if segment.mode == "passive" and some_driven:
                 continue
@@ -54,18 +56,19 @@ class SegmentActions:
                     "needs tendons driven by length."
                 )
             arms = np.array([tendon.position(k + 1)[k] for tendon in segment.tendons])
-            if np.linalg.matrix_rank(arms) < 2:
-                raise RobotError(
-                    f"the tendons of segment {k + 1} of robot {robot.name!r} bend it in one "
-                    "plane; an action needs two."
-                )
             offsets[k] = offset or np.hypot(*arms[0])
-        bends = np.zeros((n, 2, 3 * n))  # about d1 and d2, by the action
-        for k in map(int, np.flatnonzero(offsets)):
-            bends[k, 1, 3 * k + 1], bends[k, 0, 3 * k + 2] = 1.0 / offsets[k], -1.0 / offsets[k]
+            toward = np.eye(2)  # of the displacements, in the base's d1 and d2
+            if np.linalg.matrix_rank(arms, tol=1e-9 * offsets[k]) < 2:
+                nearer, along = int(np.argmax(np.abs(arms[0]))), arms[0] / np.hypot(*arms[0])
+                toward = np.zeros((2, 2))
+                toward[nearer] = along * np.sign(along[nearer])
+            own = toward.T / offsets[k]
+            bends[k, 1, 3 * k + 1 : 3 * k + 3], bends[k, 0, 3 * k + 1 : 3 * k + 3] = own[0], -own[1]
         self.robot = robot
         self.offset: Floats = offsets
         """(n_segments,) displacement per bend, 0 of a passive segment [m/rad]."""
+        self.bends: Flags = np.abs(bends).max((0, 1)) > 0.0
+        """(3 n_segments,) which numbers of an action bend a segment."""
         self.by_extension: Floats = np.zeros((n, 3 * n))
         """(n_segments, 3 n_segments) d(extension)/d(action)."""
         self.by_extension[np.arange(n), 3 * np.arange(n)] = 1.0

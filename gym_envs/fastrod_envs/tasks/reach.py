@@ -217,7 +217,7 @@ def drives_of(robot: Robot) -> tuple[Ints, Floats, Floats]:
     """See `drives`, of any robot whose segments are driven by the lengths of tendons around them: all
     bends, up to `BEND`, and the extensions that its file allows. Raises `InputError` for another robot."""
     try:
-        offset = SegmentActions(robot).offset
+        actions = SegmentActions(robot)
     except RobotError as error:
         raise InputError(f"robot {robot.name!r} does not suit Reach: {error}") from error
     driven: list[int] = []
@@ -225,8 +225,8 @@ def drives_of(robot: Robot) -> tuple[Ints, Floats, Floats]:
     for k, segment in enumerate(robot.segments):
         if segment.extension[0] < segment.extension[1]:
             driven, limit = [*driven, 3 * k], [*limit, segment.extension]
-        if (bend := BEND * float(offset[k])) > 0.0:
-            driven, limit = [*driven, 3 * k + 1, 3 * k + 2], [*limit, (-bend, bend), (-bend, bend)]
+        bend, own = BEND * float(actions.offset[k]), [j for j in (3 * k + 1, 3 * k + 2) if actions.bends[j]]
+        driven, limit = [*driven, *own], [*limit, *[(-bend, bend)] * len(own)]
     rate = [0.8 * (high - low) if j % 3 == 0 else high for j, (low, high) in zip(driven, limit, strict=True)]
     return np.array(driven), np.array(limit), np.array(rate)
 

@@ -4,7 +4,7 @@ group by group."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +72,10 @@ def drive_controls(world: World, teleop: Teleop) -> list[Group]:
     robot, groups = world.robot, []
     n = robot.n_segments
     if len(teleop.driven) > 1:
-        groups.append(Group("", tuple(_all_bend(teleop, axis) for axis in (0, 1))))
+        some = ([k for k in teleop.driven if teleop.bends(k, axis)] for axis in (0, 1))
+        groups.append(
+            Group("", tuple(_all_bend(teleop, bent, axis) for axis, bent in enumerate(some) if bent))
+        )
     if teleop.actions is not None:
         own = ((k, _segment(robot, teleop, k)) for k in range(n))
         groups += [Group(f"Segment {k + 1}", controls, n <= 2) for k, controls in own if controls]
@@ -115,12 +118,12 @@ def load_controls(robot: Robot, teleop: Teleop, *, rings: bool = False) -> Group
     return Group("", (*(_force(teleop, axis, most) for axis in range(3)), payload, gravity))
 
 
-def _all_bend(teleop: Teleop, axis: int) -> Control:
+def _all_bend(teleop: Teleop, bent: Sequence[int], axis: int) -> Control:
     def get() -> float:
-        return float(np.mean([teleop.bent(k)[axis] for k in teleop.driven])) / _DEGREE
+        return float(np.mean([teleop.bent(k)[axis] for k in bent])) / _DEGREE
 
     def put(degrees: float) -> None:
-        for k in teleop.driven:
+        for k in bent:
             _bend(teleop, k, axis, degrees)
 
     name = "xy"[axis]
@@ -141,7 +144,8 @@ def _segment(robot: Robot, teleop: Teleop, k: int) -> tuple[Control, ...]:
             get=lambda axis=axis: teleop.bent(k)[axis] / _DEGREE,  # type: ignore[misc]
             put=lambda v, axis=axis: _bend(teleop, k, axis, v),  # type: ignore[misc]
         )
-        for axis, name in enumerate("xy" if k in teleop.driven else "")
+        for axis, name in enumerate("xy")
+        if teleop.bends(k, axis)
     )
     low, high = (v / _MM for v in robot.segments[k].extension)
     if high <= low:

@@ -159,7 +159,11 @@ class Teleop:
     @property
     def driven(self) -> list[int]:
         """Segments that bends drive, from 0, base first."""
-        return [] if self.actions is None else np.flatnonzero(self.actions.offset).tolist()
+        return [k for k in range(self.robot.n_segments) if self.bends(k, 0) or self.bends(k, 1)]
+
+    def bends(self, segment: int, axis: int) -> bool:
+        """Whether a segment can be bent toward x or y of its base (0 or 1)."""
+        return self.actions is not None and bool(self.actions.bends[3 * segment + 1 + axis])
 
     def bend(self, segment: int, toward_x: float, toward_y: float) -> None:
         """Bend a segment (from 0, base first) toward x and y of its base [rad], within `LARGEST_BEND`."""
@@ -410,6 +414,7 @@ def _limits(robot: Robot, actions: SegmentActions | None, limits: TendonLimits) 
     if actions is None:
         return np.zeros(0), np.zeros(0)
     upper = np.repeat(np.minimum(LARGEST_BEND * actions.offset, _INSIDE * limits.displacement), 3)
+    upper *= actions.bends
     lower = -upper
     lower[::3], upper[::3] = (np.array([segment.extension[i] for segment in robot.segments]) for i in (0, 1))
     return lower, upper

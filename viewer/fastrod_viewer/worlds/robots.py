@@ -72,7 +72,7 @@ class Loads:
 
 
 def actions_of(robot: Robot) -> SegmentActions | None:
-    """Return the actions of its segments; None unless each is driven by tendon lengths in two directions."""
+    """Return the actions of its segments; None unless they are driven by tendon lengths."""
     try:
         return SegmentActions(robot)
     except RobotError:
