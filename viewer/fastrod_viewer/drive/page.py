@@ -107,7 +107,8 @@ class DrivePage(ViewerPage):
             self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER)
         )
         self.session = Session(world, self.teleop, draw=self._draw, link=link, script=script)
-        ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
+        least, most = 0.02 * world.robot.length, 0.1 * world.robot.length  # of a slim one, to be caught
+        ball = min(max(1.25 * self.drawing.radius, least), most)
         middle, can = world.rods[0].place[0], self._can_drag()
         self.drag_handle = DragHandle(server, self.session, ball, middle, may=may) if can else None
         self._latency = float("nan")
