@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fastrod import Robot, Segment, Tendon
@@ -35,6 +37,12 @@ def rod(
     tendons = tuple(Tendon(offset=offset, angle=angle, compliance=compliance) for angle in angles)
     given = {"length": 0.07, "bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001} | segment
     return Robot(name=mode, segments=(Segment(mode=mode, tendons=tendons, **given),))
+
+
+def behind_a_passive_one(robot: Robot) -> Robot:
+    """The robot behind a passive segment, as at the end of a catheter."""
+    free = replace(robot.segments[0], mode="passive", tendons=())
+    return replace(robot, name="catheter", segments=(free, *robot.segments))
 
 
 def bend(robot: Robot, angle_x: float, angle_y: float, segment: int = 0) -> np.ndarray:

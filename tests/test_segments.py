@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rods import rod
+from rods import behind_a_passive_one, rod
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.errors import InputError
@@ -74,8 +74,7 @@ def test_the_first_displacement_bends_toward_d1_and_the_second_toward_d2(entry: 
 
 
 def test_a_passive_segment_takes_a_share_of_the_bend_of_the_tendons_that_cross_it() -> None:
-    driven = stiff_wires(1).segments[0]
-    robot = Robot(name="catheter", segments=(replace(driven, mode="passive", tendons=()), driven))
+    robot = behind_a_passive_one(stiff_wires(1))
     actions = SegmentActions(robot)
     assert actions.offset.tolist() == [0.0, 0.008]
     state = Simulator(robot).settle(**actions.inputs([0.0, 9.0, 9.0, 0.0, 0.3 * 0.008, 0.4 * 0.008]))

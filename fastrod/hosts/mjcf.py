@@ -43,7 +43,7 @@ def mjcf(robot: Robot, *, pieces: int | None = None, comment: str = "") -> str:
     It leaves out shear, effects and extension: use it for contact and control in MuJoCo's world, and fastrod
     for what the rod does.
     """
-    if any(segment.mode != "tendon_length" for segment in robot.segments):
+    if {segment.mode for segment in robot.segments} - {"passive"} != {"tendon_length"}:
         raise InputError(f"robot {robot.name!r} is not driven by tendon lengths; no MJCF is written of it.")
     pieces = pieces or pieces_of(robot)
     kp, armature = _drives(robot, pieces)

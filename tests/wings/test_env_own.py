@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.testing import assert_array_equal
+from rods import behind_a_passive_one
 
 import fastrod
 import fastrod_envs
@@ -242,9 +243,7 @@ def test_reach_with_a_robot_file_is_a_gymnasium_environment(tmp_path: Path) -> N
 
 
 def test_reach_drives_the_segments_that_are_not_passive(tmp_path: Path) -> None:
-    tip = fastrod.load_robot("tdcr_b").segments[0]
-    robot = fastrod.Robot(name="catheter", segments=(replace(tip, mode="passive", tendons=()), tip))
-    fastrod.save_robot(robot, tmp_path / "catheter.toml")
+    fastrod.save_robot(behind_a_passive_one(fastrod.load_robot("prototype")), tmp_path / "catheter.toml")
     env = BatchEnv("Reach", 2, robot=tmp_path / "catheter.toml")
     assert env.task.driven.tolist() == [4, 5]
 

@@ -1,13 +1,13 @@
 """Goals become motion within limits; sessions run, stop and record; all without a browser."""
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pages import until
+from rods import behind_a_passive_one
 
 import fastrod
 from fastrod.errors import InputError
@@ -25,11 +25,7 @@ DT = 1.0 / 30.0
 
 def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Teleop]:
     robot = fastrod.load_robot("prototype" if name == "catheter" else name)
-    if name == "catheter":
-        robot = replace(
-            robot, segments=(replace(robot.segments[0], mode="passive", tendons=()), *robot.segments)
-        )
-    world = FreeWorld(robot)
+    world = FreeWorld(behind_a_passive_one(robot) if name == "catheter" else robot)
     return world, Teleop(world)
 
 
