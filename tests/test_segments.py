@@ -82,16 +82,17 @@ def test_a_passive_segment_takes_a_share_of_the_bend_of_the_tendons_that_cross_i
     assert state.position[0, 20, 0] / state.tip_position[0, 0] == pytest.approx(0.26, abs=0.01)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.6, 1.5, 2.5])
-def test_a_segment_of_tendons_in_one_plane_bends_in_it(angle: float) -> None:
-    segment = stiff_wires(1, n_tendons=2).segments[0]
-    turned = replace(segment, tendons=tuple(replace(t, angle=t.angle + angle) for t in segment.tendons))
-    robot, along = Robot(name="flat", segments=(turned,)), np.array([np.cos(angle), np.sin(angle)])
+# the last of few digits, as a file may have them: by so little its tendons are off one plane
+@pytest.mark.parametrize(("angle", "digits"), [(0.0, 9), (0.6, 9), (1.5, 9), (2.5, 9), (0.6, 3)])
+def test_a_segment_of_tendons_in_one_plane_bends_in_it(angle: float, digits: int) -> None:
+    one = stiff_wires(1, n_tendons=2).segments[0]
+    flat = replace(one, tendons=tuple(replace(t, angle=round(t.angle + angle, digits)) for t in one.tendons))
+    robot, along = Robot(name="flat", segments=(flat,)), np.array([np.cos(angle), np.sin(angle)])
     (number,) = np.flatnonzero((actions := SegmentActions(robot)).bends)
     assert number == 1 + np.argmax(np.abs(along))
     tip = Simulator(robot, points_per_segment=10).settle(**actions.inputs(0.5 * 0.008 * np.eye(3)[number]))
     expected = np.sign(along[number - 1]) * along * 0.1 / 0.5 * (1.0 - np.cos(0.5))
-    assert_allclose(tip.tip_position[0, :2], expected, atol=1e-6)
+    assert_allclose(tip.tip_position[0, :2], expected, atol=1e-6 if digits == 9 else 5e-6)
 
 
 def test_the_matrix_is_the_slope_of_the_inputs() -> None:

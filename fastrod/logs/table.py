@@ -98,7 +98,8 @@ def _read_csv(path: Path) -> Table:
 
 
 def _decoded(content: bytes) -> str:
-    """UTF-8, or what a spreadsheet writes: UTF-16 with its mark, or the letters of Windows."""
+    """A text in UTF-8, or as a spreadsheet writes it: UTF-16 with its mark, or the letters of Windows. Raises
+    `UnicodeDecodeError` for bytes that are no text."""
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return content.decode("utf-16")
     try:

@@ -12,6 +12,8 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Flags, Floats
 
+_ONE_PLANE = 0.01  # rad: by so little tendons are off one plane whose angles a file has in a few digits
+
 
 class TendonInputs(TypedDict):
     """Keyword arguments of `Simulator.step`."""
@@ -56,10 +58,11 @@ class SegmentActions:
                     "needs tendons driven by length."
                 )
             arms = np.array([tendon.position(k + 1)[k] for tendon in segment.tendons])
-            offsets[k] = offset or np.hypot(*arms[0])
+            arm = np.hypot(*arms[0])
+            offsets[k] = offset or arm
             toward = np.eye(2)  # of the displacements, in the base's d1 and d2
-            if np.linalg.matrix_rank(arms, tol=1e-9 * offsets[k]) < 2:
-                nearer, along = int(np.argmax(np.abs(arms[0]))), arms[0] / np.hypot(*arms[0])
+            if np.linalg.matrix_rank(arms, tol=_ONE_PLANE * arm) < 2:
+                nearer, along = int(np.argmax(np.abs(arms[0]))), arms[0] / arm
                 toward = np.zeros((2, 2))
                 toward[nearer] = along * np.sign(along[nearer])
             own = toward.T / offsets[k]

@@ -244,8 +244,7 @@ def test_reach_with_a_robot_file_is_a_gymnasium_environment(tmp_path: Path) -> N
 
 def test_reach_drives_the_segments_that_are_not_passive(tmp_path: Path) -> None:
     fastrod.save_robot(behind_a_passive_one(fastrod.load_robot("prototype")), tmp_path / "catheter.toml")
-    env = BatchEnv("Reach", 2, robot=tmp_path / "catheter.toml")
-    assert env.task.driven.tolist() == [4, 5]
+    assert BatchEnv("Reach", 2, robot=tmp_path / "catheter.toml").task.driven.tolist() == [4, 5]
 
 
 @pytest.mark.parametrize(

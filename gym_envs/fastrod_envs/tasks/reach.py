@@ -214,8 +214,9 @@ def drives() -> tuple[Ints, Floats, Floats]:
 
 
 def drives_of(robot: Robot) -> tuple[Ints, Floats, Floats]:
-    """See `drives`, of any robot whose segments are driven by the lengths of tendons around them: all
-    bends, up to `BEND`, and the extensions that its file allows. Raises `InputError` for another robot."""
+    """See `drives`, of any robot whose segments are driven by the lengths of tendons, or passive: all
+    bends that these make, up to `BEND`, and the extensions that its file allows. Raises `InputError` for
+    another robot."""
     try:
         actions = SegmentActions(robot)
     except RobotError as error:

@@ -107,7 +107,7 @@ def drifts(work: ModalWork, w: int) -> bool:
 
 @inline
 def rests(work: ModalWork, w: int, tolerance: float) -> bool:
-    """Whether the Newton step was undamped, and smaller than `tolerance` [rad] or one that drifts."""
+    """Whether the step was undamped, and smaller than `tolerance` [rad] or along what nothing holds."""
     small = read(work.newton, L_SIZE, w) * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
     return undamped(read(work.newton, L_SIGMA, w)) and (small or drifts(work, w))
 
@@ -115,8 +115,8 @@ def rests(work: ModalWork, w: int, tolerance: float) -> bool:
 @kernel
 def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
     """Size [rad] of the Newton step in `work.gradient`, and the fraction of it that is taken: no longer than
-    LONGEST_STEP, none where the Hessian had a negative pivot or the robot is done. Whether every robot's is
-    undamped and smaller than `tolerance`: its energy need not be looked at."""
+    LONGEST_STEP, none where the Hessian had a negative pivot or the robot is done. Whether every robot
+    `rests` after it: its energy need not be looked at."""
     n_modes, newton, every = b.component.shape[0], work.newton, True
     clear(newton[L_SIZE * W : (L_SIZE + 1) * W])
     for p in range(work.piece.shape[0]):
