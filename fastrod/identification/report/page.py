@@ -111,7 +111,8 @@ def _bars(result: Result) -> list[dict[str, Any]]:
             ("held out", "before", test.before, test.interval),
             ("train", "before train", train.before, ()),
         ]
-    widest = max((value for _, _, value, _ in rows if math.isfinite(value)), default=0.0)
+    ends = (end for _, _, value, interval in rows for end in (value, *interval) if math.isfinite(end))
+    widest = max(ends, default=0.0)
     whole = max(widest, floor, 1e-12) / 86.0
     made = []
     for label, kind, value, interval in rows:
