@@ -542,4 +542,3 @@ def test_hosts_say_what_cannot_be_carried() -> None:
         _ = world.stepSimulaton
     with pytest.raises(FastrodError, match="robot is 'ur5'; give a Robot"):
         SoftManiSim(robot="ur5")
-    world.disconnect()

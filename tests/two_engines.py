@@ -45,10 +45,7 @@ def flange() -> Any:
     from fastrod.hosts import BulletArm, connect
     from fastrod_scenes.robots import ur5_path
 
-    world = connect(dt=DT)
-    pose = BulletArm.load(world, ur5_path(), tip="tool0").frame(JOINTS)
-    world.disconnect()
-    return pose
+    return BulletArm.load(connect(dt=DT), ur5_path(), tip="tool0").frame(JOINTS)
 
 
 def block_at() -> Any:

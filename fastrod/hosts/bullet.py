@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
@@ -24,20 +26,43 @@ def pybullet() -> Any:
     return module
 
 
+class Connection:
+    """A connection to PyBullet. The number of one that has ended goes to another world in time: whoever had
+    it before is to get no answer."""
+
+    def __init__(self, number: int, client: Any = None) -> None:
+        if number in _KNOWN:
+            _KNOWN[number].lose()
+        self.number, self.client = number, client
+        self.handle = number
+        """physicsClientId; -1, which no world has, once this one has ended."""
+        self.own: weakref.finalize[[int], Connection] | None = None
+        """For a world of ours, what ends it."""
+        _KNOWN[number] = self
+
+    def lose(self) -> None:
+        """It has ended."""
+        self.handle = -1
+        if self.own is not None:
+            self.own.detach()
+
+
+_KNOWN: weakref.WeakValueDictionary[int, Connection] = weakref.WeakValueDictionary()
+"""Connections by their numbers."""
+
+
 class Bullet:
     """One PyBullet world: every function of the module, called with this world's physicsClientId.
 
     Takes what a user has: a client's number, the module itself, a `BulletClient`, another `Bullet`.
-    `HostError` where no world answers.
+    `HostError` where no world answers, be it that its number has been given to another one since.
     """
 
     def __init__(self, bullet: Any) -> None:
-        if isinstance(bullet, Bullet):
-            number = bullet.number
-        elif isinstance(bullet, ModuleType) and bullet.__name__ == "pybullet":
-            number = 0
-        else:
-            number = getattr(bullet, "_client", bullet)
+        client = None if isinstance(bullet, (int, ModuleType)) else bullet
+        if isinstance(bullet, ModuleType) and bullet.__name__ == "pybullet":
+            bullet = 0
+        number = bullet.number if isinstance(bullet, Bullet) else getattr(bullet, "_client", bullet)
         if isinstance(number, bool) or not isinstance(number, int):
             raise HostError(
                 f"bullet is {bullet!r}; give a physicsClientId, the pybullet module or a "
@@ -45,6 +70,9 @@ class Bullet:
             )
         self.number: int = number
         """physicsClientId."""
+        known = bullet.connection if isinstance(bullet, Bullet) else _KNOWN.get(number)
+        another = known is not None and known.client not in (None, client) and client is not None
+        self.connection: Connection = Connection(number, client) if known is None or another else known
         if not self.isConnected():
             raise HostError(
                 f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect()."
@@ -57,23 +85,15 @@ class Bullet:
         except AttributeError:
             raise AttributeError(f"PyBullet has no {name!r}; {nearest(name, dir(module))}") from None
         if callable(value):
-            value = self._bound(name, value, module.error)
+            value = _bound(self.connection, value, module)
         self.__dict__[name] = value  # read once
         return value
 
-    def _bound(self, name: str, function: Callable[..., Any], error: type[Exception]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def call(*args: Any, **options: Any) -> Any:
-            try:
-                return function(*args, physicsClientId=self.number, **options)
-            except error as what:
-                if not pybullet().isConnected(physicsClientId=self.number):
-                    raise HostError(f"PyBullet's world {self.number} has been disconnected.") from what
-                raise HostError(
-                    f"PyBullet refused {name}: {str(what).rstrip('.')}; is the body still in the world?"
-                ) from what
-
-        return call
+    def disconnect(self) -> None:
+        """End this world. `HostError` where it has ended before."""
+        end = getattr(self.connection.client, "disconnect", None)  # which forgets its number, too
+        end() if end is not None else _bound(self.connection, pybullet().disconnect, pybullet())()
+        self.connection.lose()
 
     @property
     def dt(self) -> float:
@@ -108,7 +128,8 @@ class Bullet:
 def connect(
     *, gui: bool = False, dt: float = 0.005, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 ) -> Bullet:
-    """A new, empty world with time step `dt` [s] and `gravity` [m/s^2]; headless unless `gui`.
+    """A new, empty world with time step `dt` [s] and `gravity` [m/s^2]; headless unless `gui`. It ends with
+    the last `Bullet`, base or rod that refers to it.
 
     `HostError` for a GUI without a display: PyBullet itself would end the process. `InputError` on wrong
     numbers.
@@ -128,7 +149,33 @@ def connect(
     number = module.connect(module.GUI if gui else module.DIRECT)
     if number < 0:
         raise HostError("PyBullet opened no world; a GUI can be open only once in a process.")
+    connection = Connection(number)
+    # who has no `Bullet` of it can ask it nothing, and it holds 30 MB
+    connection.own = weakref.finalize(connection, _end, number)
+    connection.own.atexit = False
     world = Bullet(number)
     world.setGravity(*gravity)
     world.setTimeStep(dt)
     return world
+
+
+def _end(number: int) -> None:
+    module = pybullet()
+    with suppress(module.error):  # who disconnected it did not tell us
+        module.disconnect(physicsClientId=number)
+
+
+def _bound(connection: Connection, function: Callable[..., Any], module: Any) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        try:
+            return function(*args, physicsClientId=connection.handle, **options)
+        except module.error as what:
+            if not module.isConnected(physicsClientId=connection.handle):
+                raise HostError(f"PyBullet's world {connection.number} has been disconnected.") from what
+            raise HostError(
+                f"PyBullet refused {function.__name__}: {str(what).rstrip('.')}; is the body still in the "
+                "world?"
+            ) from what
+
+    return call

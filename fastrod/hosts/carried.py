@@ -34,7 +34,7 @@ _ROUNDS, _ALIKE = 3, 0.02  # in which rods on one body agree, and to how much of
 _RODS: defaultdict[int, weakref.WeakValueDictionary[int, CarriedRod]] = defaultdict(
     weakref.WeakValueDictionary
 )
-"""Rods of a world, by its number: those on one body, and those that touch one, find each other here."""
+"""Rods of a world, by its identity: those on one body, and those that touch one, find each other here."""
 
 
 class _Begun(NamedTuple):
@@ -189,6 +189,10 @@ class CarriedRod(ABC):
         self._release()
         for contact in self.body_contacts:
             contact.forget()
+
+    def _leave(self) -> None:
+        """No rod finds this one any more."""
+        self._every.pop(id(self), None)
 
     def _exert(self, state: State, point: Floats) -> None:
         """Let the host, and what the rod touches, feel this `state`; the base was at `point` (3,)."""

@@ -59,9 +59,11 @@ class BulletLink:
 
     def moves_with(self, other: Host) -> bool:
         """See `Host`: links of one body that joints hold to the world, or bases on one link of another."""
-        if not isinstance(other, BulletLink) or other.bullet.number != self.bullet.number:
+        if not isinstance(other, BulletLink) or other.bullet.connection is not self.bullet.connection:
             return False
-        carrier = self._carrier() if other.body == self.body else None
+        # the number of a body that was removed is given again, and PyBullet asks its memory for any link
+        there = other.body == self.body and other.link < self.bullet.getNumJoints(self.body)
+        carrier = self._carrier() if there else None
         return carrier is not None and carrier == other._carrier()
 
     def _carrier(self) -> int | None:
@@ -153,6 +155,8 @@ def com_motion(bullet: Bullet, body: int, link: int) -> Motion:
         linear, angular = bullet.getBaseVelocity(body)
     else:
         state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
+        if state is None:
+            bullet.check(body, link)
         position, quaternion, linear, angular = state[0], state[1], state[6], state[7]
     return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
 

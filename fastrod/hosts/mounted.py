@@ -112,7 +112,7 @@ class MountedRod(CarriedRod):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
             )
-        super().__init__(host, host.bullet.dt, host.bullet.number)
+        super().__init__(host, host.bullet.dt, id(host.bullet.connection))
         self.host, self.bullet = host, host.bullet
         check_robot(robot)
         check_gravity(robot, self._gravity(), "setGravity() in the world")
@@ -143,6 +143,7 @@ class MountedRod(CarriedRod):
     def remove(self) -> None:
         """Take the rod out of the world: its capsules, and its force on what it touched."""
         self.reset()
+        self._leave()
         self.bodies.remove()
 
     def _look(self) -> None:

@@ -217,6 +217,7 @@ class MujocoRod(CarriedRod):
     def remove(self) -> None:
         """Take the rod out: its capsules are seen and touched by nothing any more, and its forces are
         gone."""
+        self._leave()
         self._release()
         self.model.geom_contype[self._geoms] = self.model.geom_conaffinity[self._geoms] = 0
         self.model.geom_rgba[self._geoms, 3] = 0.0

@@ -66,7 +66,6 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
         np.testing.assert_array_equal(observed[rows[-1]], info["final_obs"][0])
         assert np.isnan(acted[rows[-1]]).all()
         assert np.isnan(table["reward"][rows[-1]])
-        env.close()
     assert len(set(table["seed"])) == 3
     assert table["seed"].min() >= 0
     assert table["seed"].max() > 2**40  # 32 bits would hold doubles from some ten thousand episodes on

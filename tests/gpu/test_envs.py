@@ -21,5 +21,3 @@ def test_an_episode_is_the_same(name: str) -> None:
         assert_allclose(b[0], a[0], atol=1e-6)
         assert_allclose(b[1], a[1], atol=1e-6)
         assert_array_equal(b[3], a[3])
-    for env in envs:
-        env.close()

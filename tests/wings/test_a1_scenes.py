@@ -56,4 +56,3 @@ def test_neck_stands_on_the_head_with_its_axes_as_stated():
     assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
     assert np.abs(pose[:2] - np.array(trunk[0])[:2] - MOUNT[:2]).max() < 0.02
     assert max(abs(v) for v in world.getBaseVelocity(mount.body)[0]) < 0.01
-    world.disconnect()

@@ -1,7 +1,7 @@
 """`BulletArm` and the UR5 that ships: kinematics against the published table, statics against PyBullet,
 motors against the clock."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,8 @@ def apart(a: Floats, b: Floats) -> float:
 
 
 @pytest.fixture
-def world() -> Iterator[Bullet]:
-    bullet = connect()
-    yield bullet
-    bullet.disconnect()
+def world() -> Bullet:
+    return connect()
 
 
 @pytest.fixture

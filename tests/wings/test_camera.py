@@ -14,9 +14,7 @@ FROM, AHEAD = (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 
 @pytest.fixture
 def world():
-    b = connect()
-    yield b
-    b.disconnect()
+    return connect()
 
 
 def box(b, at, half, color=(1.0, 1.0, 1.0, 1.0)):

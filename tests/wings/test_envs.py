@@ -1,6 +1,5 @@
 """Contracts of every registered task with Gymnasium and with its users."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -41,11 +40,9 @@ def several(name: str, n: int, **options: Any) -> BatchEnv:
 
 
 @pytest.fixture(params=NAMES, scope="module")
-def batch(request: pytest.FixtureRequest) -> Iterator[BatchEnv]:
+def batch(request: pytest.FixtureRequest) -> BatchEnv:
     """Three environments whose episodes have three steps."""
-    env = several(request.param, 3, n_steps=3)
-    yield env
-    env.close()
+    return several(request.param, 3, n_steps=3)
 
 
 def test_names_are_ids() -> None:

@@ -1,5 +1,6 @@
 """A PyBullet body carries a rod: where the base is, how it moves, and what the joints feel."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -194,6 +195,53 @@ def test_client_is_taken_as_users_have_it():
     assert Bullet(client).dt == pytest.approx(0.002)
     if pybullet.isConnected(0):
         assert Bullet(pybullet).number == 0
+
+
+def test_world_that_nobody_refers_to_ends_and_its_number_is_another_worlds():
+    import pybullet
+
+    world = empty_world()
+    arm, _, _ = kuka(world, 0)
+    rod = MountedRod(soft_robot(line_density=0.1), BulletLink(world, arm, 6))
+    number = world.number
+    del world
+    rod.step()
+    rod.bullet.disconnect()
+    other = empty_world()
+    gone = MountedRod(rod.rod.robot, BulletLink(other, kuka(other, 0)[0], 6))
+    gone.step()
+    other.removeBody(arm)
+    box = MountedRod(rod.rod.robot, BulletLink(other, cube(other, 0.05, 0.1, [0.0, 0.0, 0.0])))
+    assert (other.number, box.host.body) == (
+        number,
+        arm,
+    )  # a cube has no link 6, which PyBullet does not check
+    for _ in range(3):
+        assert box.step().ok[0]
+    ended = rf"^PyBullet's world {number} has been disconnected\.$"
+    for call, why in (
+        (rod.step, ended),
+        (rod.bullet.disconnect, ended),
+        (gone.step, f"body {arm} has no link 6"),
+    ):
+        with pytest.raises(HostError, match=why):
+            call()
+    del rod, gone, box, other, call
+    gc.collect()
+    assert not pybullet.isConnected(number)
+
+
+def test_rods_that_were_removed_weigh_nothing():
+    felt = []
+    for others in (0, 1):
+        world, robot = empty_world(0.01, 9.81), soft_robot(line_density=0.2, damping_time=0.05)
+        world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_PLANE))
+        body = cube(world, 0.06, 0.1, [0.0, 0.0, 0.03])
+        rod, *gone = (MountedRod(robot, BulletLink(world, body)) for _ in range(1 + others))
+        for other in gone:
+            other.remove()
+        felt.append([rod.step() and rod.wrench for _ in range(30)])
+    assert_allclose(*felt, atol=1e-12)
 
 
 def test_gui_without_a_display_is_a_sentence(monkeypatch):

@@ -34,7 +34,6 @@ def test_an_episode_of_the_shipped_policy_is_not_lost(task: str, seed: int, rand
     assert steps > 3
     if randomise is not HEAVY:
         assert info["success"]
-    env.close()
 
 
 @pytest.mark.study(beyond=3)

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,23 +25,15 @@ def about_z(angle: float) -> list[float]:
 
 
 @pytest.fixture
-def make() -> Iterator[Callable[..., SoftManiSim]]:
+def make() -> Callable[..., SoftManiSim]:
     """Robots in worlds of their own; `dt` or `gravity` opens a bare world for them."""
-    made: list[SoftManiSim] = []
-    worlds: list[Bullet] = []
 
     def build(dt: float | None = None, gravity: float = 9.81, **options: Any) -> SoftManiSim:
         if dt is not None:
-            worlds.append(connect(dt=dt, gravity=(0.0, 0.0, -gravity)))
-            options["bullet"] = worlds[-1]
-        made.append(SoftManiSim(**options))
-        return made[-1]
+            options["bullet"] = connect(dt=dt, gravity=(0.0, 0.0, -gravity))
+        return SoftManiSim(**options)
 
-    yield build
-    for sim in made:
-        sim.close()
-    for world in worlds:
-        world.disconnect()
+    return build
 
 
 def poses(b: Bullet) -> dict[int, Any]:

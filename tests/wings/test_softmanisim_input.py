@@ -1,7 +1,6 @@
 """The paper's class on fastrod's model: bad input gets one sentence, and leaves nothing behind."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -14,10 +13,8 @@ pytest.importorskip("pybullet", reason="pybullet is not installed: pip install '
 
 
 @pytest.fixture(scope="module")
-def one() -> Iterator[SoftManiSim]:
-    sim = SoftManiSim(number_of_sphere=6)
-    yield sim
-    sim.close()
+def one() -> SoftManiSim:
+    return SoftManiSim(number_of_sphere=6)
 
 
 def moved(*given: Any, **base: Any) -> Any:

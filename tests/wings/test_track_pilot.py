@@ -57,7 +57,6 @@ def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str,
         found["dl"].append(task._inputs()["tendon_length"][0] - robot.rest_tendon_length)
         found["tip"].append(task.measured()[0])
     found["distance"] = info["distance"]
-    env.close()
     return found
 
 

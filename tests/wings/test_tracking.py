@@ -35,7 +35,6 @@ def follow(path, seconds, **options):
         for k in range(round(seconds / stage.dt)):
             stage.advance(k * stage.dt)
             yield (k + 1) * stage.dt
-        stage.close()
 
     return record(stage, times())
 
@@ -122,14 +121,11 @@ def test_square_as_large_as_the_papers_is_beyond_the_soft_robot_alone():
 
 def test_begins_at_the_center_at_rest():
     robot = SoftUR5(dt=0.02, tip=CENTER)
-    try:
-        assert_allclose(robot.tip(), CENTER, atol=1e-6)
-        assert_allclose(robot.rest(), CENTER, atol=1e-6)
-        for _ in range(5):
-            robot.advance(CENTER - robot.tip(), np.zeros(3))
-        assert_allclose(robot.tip(), CENTER, atol=2e-5)  # the motors take up the rod's weight
-    finally:
-        robot.world.disconnect()
+    assert_allclose(robot.tip(), CENTER, atol=1e-6)
+    assert_allclose(robot.rest(), CENTER, atol=1e-6)
+    for _ in range(5):
+        robot.advance(CENTER - robot.tip(), np.zeros(3))
+    assert_allclose(robot.tip(), CENTER, atol=2e-5)  # the motors take up the rod's weight
 
 
 @pytest.mark.parametrize("name", ["square", "circle", "figure_eight", "helix", "square_helix"])
@@ -144,18 +140,15 @@ def test_scaled_path_is_the_path_about_the_center(name):
 
 def test_following_a_mounted_rod_equals_its_own_kinematics():
     world = connect(gravity=(0.0, 0.0, -9.81))
-    try:
-        rotation = quaternion_from_vector(np.array([2.0, 0.3, 0.0]))
-        link = BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.1, 0.2, 0.5]), quaternion=rotation)
-        rod = MountedRod(track_robot(), link, capsules_per_segment=5, dynamics=False)
-        pose = link.motion().pose
-        followed = SoftTip(rod.simulator, FixedBase(pose))
-        held = SoftTip(Simulator(track_robot(), dt=rod.dt, points_per_segment=10), FixedBase(pose))
-        q = np.array([0.01, 0.5 * OFFSET, 0.2 * OFFSET, 0.02, -0.3 * OFFSET, 0.4 * OFFSET])
-        state = rod.settle(**followed.actions.inputs(q))
-        followed.follow(q, state, pose)
-        held.place(q, settle=True)
-        assert_allclose(followed.position, held.position, atol=1e-9)
-        assert_allclose(followed.jacobian(rotation=True), held.jacobian(rotation=True), rtol=1e-6, atol=1e-6)
-    finally:
-        world.disconnect()
+    rotation = quaternion_from_vector(np.array([2.0, 0.3, 0.0]))
+    link = BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.1, 0.2, 0.5]), quaternion=rotation)
+    rod = MountedRod(track_robot(), link, capsules_per_segment=5, dynamics=False)
+    pose = link.motion().pose
+    followed = SoftTip(rod.simulator, FixedBase(pose))
+    held = SoftTip(Simulator(track_robot(), dt=rod.dt, points_per_segment=10), FixedBase(pose))
+    q = np.array([0.01, 0.5 * OFFSET, 0.2 * OFFSET, 0.02, -0.3 * OFFSET, 0.4 * OFFSET])
+    state = rod.settle(**followed.actions.inputs(q))
+    followed.follow(q, state, pose)
+    held.place(q, settle=True)
+    assert_allclose(followed.position, held.position, atol=1e-9)
+    assert_allclose(followed.jacobian(rotation=True), held.jacobian(rotation=True), rtol=1e-6, atol=1e-6)

@@ -42,7 +42,6 @@ def test_walls_leave_the_entry_open_and_nothing_else() -> None:
         away = np.abs(turned - box.entry) > 2e-3  # PyBullet's rays feel an edge a millimetre early
         assert (stopped == (turned > box.entry))[away].all()
         assert stopped.all() == (box.entry == 0.0)
-        world.disconnect()
 
 
 def test_box_that_cannot_be_is_a_sentence() -> None:
@@ -95,7 +94,6 @@ def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
     assert_allclose(quaternion, [0.0, 0.0, 1.0, 0.0], atol=1e-12)
     assert not world.getCollisionShapeData(bracket.body, -1)
     assert len(world.getVisualShapeData(bracket.body)) == 3
-    world.disconnect()
 
 
 @pytest.mark.study(beyond=4)

@@ -17,9 +17,7 @@ ROTATION = [0.1, 0.2, -0.3, 0.927361849549570]  # x y z w
 
 @pytest.fixture
 def world():
-    made = empty_world()
-    yield made
-    made.disconnect()
+    return empty_world()
 
 
 def extent(points):
