@@ -495,7 +495,7 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
 
     far = (
         f"more than {_LONGEST_MOVE:g} lengths of robot {robot.name!r} ({robot.length:g} m). "
-        "Was it given in mm?"
+        "Was it given in mm, or in cm?"
     )
     for name, places in _measured(log):
         away = norm(places)

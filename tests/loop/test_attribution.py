@@ -271,7 +271,7 @@ BAD = {
     "no input": (lambda: all_rows(dl=np.nan), "no row in which every input is there"),
     "a tip that stands still": (lambda: all_rows(tip_position=0.05), "the measured tip never moves"),
     "signs": (lambda: replace(backlash_log(), dl=-backlash_log().dl), SIGNS),
-    "columns turned on": (lambda: other([1, 2, 3, 0]), f"{AFAR}.*order of the dl_"),
+    "columns turned on": (lambda: other([1, 2, 3, 0]), rf"{AFAR}.* in the order 4, 1, 2, 3\. "),
     "columns reversed": (lambda: other([3, 2, 1, 0]), AFAR),
     "millimetres": (lambda: replace(backlash_log(), dl=1e3 * backlash_log().dl), UNITS),
     "two markers": (lambda: every_other(lambda tip: np.add(tip, [0.02, 0.0, 0.0])), MIXED),

@@ -19,6 +19,7 @@ from fastrod.types import Floats, Ints
 
 _BEND = 0.2  # rad, by which the model is bent for its answers
 _STARTS, _ROUNDS = 300, 5  # of the rotations of segments, drawn; of matching from each
+_ALIKE = 1.05  # times what the best signs leave
 _SEEN = 1e-3  # of the largest singular value: directions of the commands that are as small say nothing
 
 
@@ -57,7 +58,15 @@ def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> Column
         return None
     segment = np.asarray(robot.tendon_segment)
     if not sign:
-        return _matched(measured, model, segment, np.zeros(robot.n_segments))
+        still = np.zeros(robot.n_segments)
+        free = _matched(measured, model, segment, still, signed=True)
+        each = [(one, _matched(one * measured, model, segment, still)) for one in (1.0, -1.0)]
+        # two tendons across from each other answer alike with opposite signs: drives of both signs are rare
+        alike = [
+            replace(m, sign=one * m.sign, answer=measured) for one, m in each if m.left < _ALIKE * free.left
+        ]
+        moved = [np.count_nonzero(m.order != np.arange(len(m.order))) - m.sign[0] for m in alike]
+        return alike[int(np.argmin(moved))] if alike else free
     starts = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, (_STARTS, robot.n_segments))
     found = [_matched(sign * measured, model, segment, start, rotated=True) for start in starts]
     best = min(found, key=lambda each: each.left)
@@ -96,10 +105,16 @@ def _answers(robot: Robot) -> Floats:
 
 
 def _matched(
-    measured: Floats, model: Floats, segment: Ints, rotation: Floats, *, rotated: bool = False
+    measured: Floats,
+    model: Floats,
+    segment: Ints,
+    rotation: Floats,
+    *,
+    rotated: bool = False,
+    signed: bool = False,
 ) -> ColumnOrder:
     """The order that matches best near a `rotation` of each segment (n_segments,) [rad]; with `rotated` that
-    is fitted too, and all signs are 1."""
+    is fitted too, with `signed` each column may have its own sign."""
     tendon = np.arange(len(model))
     for _ in range(_ROUNDS if rotated else 1):
         c, s = np.cos(rotation[segment]), np.sin(rotation[segment])
@@ -107,7 +122,7 @@ def _matched(
             [c * model[:, 0] - s * model[:, 1], s * model[:, 0] + c * model[:, 1], model[:, 2]], 1
         )
         same, reverse = (((sign * measured[:, None] - seen) ** 2).sum(2) for sign in (1.0, -1.0))
-        apart = same if rotated else np.minimum(same, reverse)
+        apart = np.minimum(same, reverse) if signed else same
         order = linear_sum_assignment(apart.T)[1]
         if rotated:
             flat = measured[order, :2]
