@@ -40,6 +40,15 @@ class Connection:
         """For a world of ours, what ends it."""
         _KNOWN[number] = self
 
+    @classmethod
+    def of(cls, number: int, client: Any) -> Connection:
+        """The connection that has this number now."""
+        known = _KNOWN.get(number)
+        if known is None or known.handle < 0:
+            return cls(number, client)
+        another = client is not None and client is not known.client
+        return cls(number, client) if another and (known.client or known.own) else known
+
     def lose(self) -> None:
         """It has ended."""
         self.handle = -1
@@ -59,7 +68,7 @@ class Bullet:
     """
 
     def __init__(self, bullet: Any) -> None:
-        client = None if isinstance(bullet, (int, ModuleType)) else bullet
+        client = None if isinstance(bullet, (int, ModuleType, Bullet)) else bullet
         if isinstance(bullet, ModuleType) and bullet.__name__ == "pybullet":
             bullet = 0
         number = bullet.number if isinstance(bullet, Bullet) else getattr(bullet, "_client", bullet)
@@ -70,9 +79,9 @@ class Bullet:
             )
         self.number: int = number
         """physicsClientId."""
-        known = bullet.connection if isinstance(bullet, Bullet) else _KNOWN.get(number)
-        another = known is not None and known.client not in (None, client) and client is not None
-        self.connection: Connection = Connection(number, client) if known is None or another else known
+        self.connection: Connection = (
+            bullet.connection if isinstance(bullet, Bullet) else Connection.of(number, client)
+        )
         if not self.isConnected():
             raise HostError(
                 f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect()."

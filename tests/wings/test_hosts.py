@@ -193,6 +193,11 @@ def test_client_is_taken_as_users_have_it():
     client = BulletClient(pybullet.DIRECT)
     client.setTimeStep(0.002)
     assert Bullet(client).dt == pytest.approx(0.002)
+    assert Bullet(Bullet(client)).connection is Bullet(client._client).connection
+    pybullet.disconnect(world.number)
+    next_one = BulletClient(pybullet.DIRECT)  # of the same number
+    assert Bullet(next_one).isConnected()
+    assert not world.isConnected()
     if pybullet.isConnected(0):
         assert Bullet(pybullet).number == 0
 
