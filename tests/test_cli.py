@@ -261,7 +261,7 @@ def test_wrong_input_is_one_sentence_and_code_2(log: Path, capsys: Captured, cas
 
 BAD_CELLS = {
     "text in a number": (LOG.replace("0.001", "left"), "log.csv row 2, column tip_x is 'left'"),
-    "millimetres": (LOG.replace("0.001", "1000"), "Was it given in mm?"),
+    "millimetres": (LOG.replace("0.001", "1000"), "Was it given in mm, or in cm?"),
     "empty": ("", "log.csv is empty"),
     "column name over two lines": (
         't,"zz\nyy"\n0,0\n',

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from identification.logs import displacement_of, log_of, one_segment
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
+from reportlog import backlash_log
 
 from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
+from fastrod.identification.log.repeats import fresh, sentences
+from fastrod.identification.log.replay import replay
+from fastrod.model.robotfile import load_robot
 
 SIGMA = np.array([2e-4, 3e-4, 5e-4])
 RATE = 15.0
@@ -187,3 +194,20 @@ def test_outliers_are_looked_for_in_each_run_alone() -> None:
     residual[[30, 125]] += 30.0 * SIGMA
     good = keep(sample(log), residual, Noise(SIGMA, 0.0, "known"))
     assert np.flatnonzero(~good).tolist() == [30]
+
+
+@pytest.mark.study(beyond=1)
+@pytest.mark.parametrize(
+    "law", [{"name": "backlash", "half_width": 3e-4}, {"name": "friction", "half_width": 3e-4}]
+)
+def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law: Any) -> None:
+    log, robot, rows = backlash_log(), load_robot("prototype"), np.arange(420)
+    tip = replay(log, replace(robot, effects=(law,))).tip_position
+    for seen in (tip, tip.round(3)):
+        assert sentences(replace(log, tip_position=seen)) == []
+    noisy = tip + np.random.default_rng(0).normal(0.0, 1e-4, tip.shape)
+    for every in (2, 4, 7):
+        seen = replace(log, tip_position=noisy[rows // every * every])
+        moved = (log.dl != log.dl[rows // every * every]).any(axis=1)
+        assert_array_equal(fresh(seen).measured, ~moved)
+        assert sentences(seen)[0].startswith(f"{moved.sum()} of 420 rows repeat the measured tip")

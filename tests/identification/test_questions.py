@@ -262,7 +262,7 @@ def test_a_camera_a_metre_away_is_no_other_unit(tmp_path: Path) -> None:
     (tmp_path / "far.csv").write_text(farlog.csv(run))
     assert len(read_log(tmp_path / "far.csv", ROBOT)) == 120
     (tmp_path / "mm.csv").write_text(farlog.csv(run._replace(tip=1e3 * run.tip)))
-    with pytest.raises(LogError, match=r"Was it given in mm\?"):
+    with pytest.raises(LogError, match=r"Was it given in mm, or in cm\?"):
         read_log(tmp_path / "mm.csv", ROBOT)
 
 

@@ -150,6 +150,19 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
 
 
 @pytest.mark.study
+@pytest.mark.parametrize("camera", ["slow", "coarse"])
+def test_a_camera_is_taken_for_what_it_is(camera: str) -> None:
+    """One that sees every third row, which the others repeat, and one that says millimetres."""
+    log, _ = sealed("gravity")
+    tip = np.asarray(log.tip_position)
+    seen = tip[np.arange(len(tip)) // 3 * 3] if camera == "slow" else tip.round(3)
+    result = identify(replace(log, tip_position=seen), robot(), threads=1)
+    assert [effect.name for effect in result.effects] == ["gravity"]
+    assert result.test.after < 1.15 * result.noise.floor
+    assert ("repeat the measured tip" in "".join(result.notes)) == (camera == "slow")
+
+
+@pytest.mark.study
 def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
     """One effect of several: for others a sibling fits to the noise."""
     result = found("stiffness_anisotropy", "stiffness_anisotropy")

@@ -14,6 +14,7 @@ from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.order import ColumnOrder, column_order
 from fastrod.identification.log.questions import left_by, read
+from fastrod.identification.log.repeats import sentences
 from fastrod.loading import robot_of
 from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot
@@ -66,7 +67,7 @@ def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int |
     if clock:
         samples = sample(on_one_clock(log, clock))
     reading = read(samples, robot, threads=threads)
-    questions = [clock_sentence(log, clock)] if clock else []
+    questions = [*sentences(log), *([clock_sentence(log, clock)] if clock else [])]
     if reading.registration is not None:
         questions.append(reading.registration.sentence())
     columns, found, left = None, robot, left_by(samples, robot, threads)

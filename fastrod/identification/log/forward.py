@@ -35,6 +35,7 @@ from fastrod.effects.executor import (
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
+from fastrod.identification.log.repeats import fresh
 from fastrod.identification.log.unknowns import Model
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog
@@ -117,7 +118,7 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     """The samples of a log, moved by its drives where these were measured; runs that are interleaved are put
     one after the other. A gap in time is a hold: its inputs stay as they were up to one step before it
     ends."""
-    log = moved(log)
+    log = fresh(moved(log))
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
     ordered, order = _held(log.rows(order), order)

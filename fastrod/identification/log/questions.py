@@ -18,6 +18,7 @@ from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.order import column_order
 from fastrod.identification.log.registration import CameraRegistration, align, size
+from fastrod.identification.log.repeats import sentences
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot
@@ -99,7 +100,7 @@ def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple
         else (f"{reading.registration.sentence()}; fastrod identify takes it from there.",)
     )
     late = (f"{clock_sentence(log, clock)}; fastrod identify lays them on one.",) if clock else ()
-    return (*late, *moved, *reading.questions)
+    return (*sentences(log), *late, *moved, *reading.questions)
 
 
 def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Reading:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.identification.log.inputs import base_of, check_driven, inputs
+from fastrod.identification.log.repeats import fresh
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog, log_of
@@ -152,7 +153,7 @@ def replay(
         tip, points, converged = _at_rest(moved(log), robot, n_points, simulator, progress)
     tip[~converged], points[~converged] = np.nan, np.nan
     return Replay(
-        log=log,
+        log=fresh(log),
         robot=robot,
         tip_position=tip,
         converged=converged,

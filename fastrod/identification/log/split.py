@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import LogError, UnknownNameError, nearest
+from fastrod.identification.log import repeats
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.inputs import check_driven
 from fastrod.identification.log.motion import let_go
-from fastrod.logs.drives import sentences
+from fastrod.logs import drives
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Ints
@@ -34,9 +35,9 @@ class SplitLog:
     """(n,) samples that no fit sees."""
     labels: Sequence[str]
     """Names of these rows, in words."""
-    drives: Sequence[str] = ()
-    """Differences between the drives' positions and their commands, where they were measured, in
-    sentences."""
+    notes: Sequence[str] = ()
+    """Differences between the drives' positions and their commands, where they were measured, and rows that
+    repeat, in sentences."""
     swings: SplitLog | None = None
     """The same of runs that were let go from where they turn back, for a fit in motion; None where none was,
     or where the robot has no mass."""
@@ -75,8 +76,8 @@ def _cut(log: RunLog, robot: Robot, held_out: Sequence[str], swings: bool) -> Sp
             f"log {log.name!r} leaves {len(rows)} rows to fit once {', '.join(labels)} are held "
             f"out; it needs {_LEAST_ROWS}."
         )
-    drives = () if log.pos is None else sentences(log)
-    return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels, drives=drives)
+    said = [*repeats.sentences(log), *([] if log.pos is None else drives.sentences(log))]
+    return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels, notes=said)
 
 
 def thinned(rows: Ints, most: int) -> Ints:

@@ -275,7 +275,7 @@ def assemble(
         advice=advice.unique([*recommended, *lacks])[:_MOST_ADVICE],
         sessions={label: final.model.identified(final.theta, k) for k, label in other_sessions.items()},
         notes=[
-            *log.drives,
+            *log.notes,
             *base.notes,
             *outcome.notes,
             *(outcome.suspected if kept else ()),
