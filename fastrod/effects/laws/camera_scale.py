@@ -1,4 +1,4 @@
-"""The camera's scale is off: a marker of another size, a focal length."""
+"""The camera's scale is off (a marker's size, a focal length), or the robot's length in its file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fastrod.types import Floats
 
 @effect
 class CameraScale(Static):
-    """The camera's scale is off: a marker of another size, a focal length.
+    """The camera's scale is off (a marker's size, a focal length), or the robot's length in its file.
 
     Equation: y = (1 + k) r
     Symbols: k scale, r tip, y what the camera sees

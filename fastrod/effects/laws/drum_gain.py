@@ -1,4 +1,4 @@
-"""Each drive pays out more or less tendon than it reports: a drum of another radius, layers of tendon."""
+"""Each drive pays out more or less than it reports: a drum's radius, layers, or the tendons' offset."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fastrod.types import Floats
 
 @effect
 class DrumGain(Static):
-    """Each drive pays out more or less tendon than it reports: a drum of another radius, layers of tendon.
+    """Each drive pays out more or less than it reports: a drum's radius, layers, or the tendons' offset.
 
     Equation: dl_i -> (1 + g_i) dl_i, antagonists alike (the part that bends)
     Symbols: g_i gain of drive i, dl_i its commanded change of length

@@ -31,9 +31,9 @@ def resolution(values: Floats) -> Floats:
 
 def fresh(log: RunLog) -> RunLog:
     """The log without what its camera repeats."""
-    old = np.zeros(len(log), dtype=np.bool_)
+    old, measured = np.zeros(len(log), dtype=np.bool_), log.measured
     for label in log.runs:
-        rows = np.flatnonzero(log.measured & (log.run == label))
+        rows = np.flatnonzero(measured & (log.run == label))
         old[rows] = repeated(np.asarray(log.tip_position)[rows], log.commands[rows])
 
     def without(seen: Floats) -> Floats:

@@ -46,6 +46,7 @@ _MOST_ADVICE = 5  # runs
 _FALLS = 0.97
 _DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
+_MOST_SPOKEN = 4  # other names of an effect
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
 _NEAR = 1.1  # of the noise: a held-out error within it is explained
 _CONFIRMS = 0.25  # of the gain on fitted data, on those held out: an effect of less is the noise's
@@ -447,6 +448,8 @@ def _spoken(name: str, model: Model, classes: dict[str, list[str]]) -> str:
     """An effect in words, with the drive that has it and the others that it may be as well."""
     drive, others = model.drive_of(name), classes.get(name, [])
     said = name if drive is None else f"{name} of drive {drive + 1}"
+    if len(others) > _MOST_SPOKEN:  # the list below the sentence has them all
+        others = [*others[: _MOST_SPOKEN - 1], f"one of {len(others) - _MOST_SPOKEN + 1} more"]
     return f"{said} (or {' or '.join(others)}: this log cannot say)" if others else said
 
 
