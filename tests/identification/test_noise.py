@@ -14,7 +14,7 @@ from reportlog import backlash_log
 from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
-from fastrod.identification.log.repeats import fresh, sentences
+from fastrod.identification.log.repeats import fresh, repeated, sentences
 from fastrod.identification.log.replay import replay
 from fastrod.model.robotfile import load_robot
 
@@ -205,6 +205,9 @@ def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law:
     tip = replay(log, replace(robot, effects=(law,))).tip_position
     for seen in (tip, tip.round(3)):
         assert sentences(replace(log, tip_position=seen)) == []
+    steps = log.dl[rows // 7 * 7]  # which are held, and a tip that is late
+    late = np.concatenate([tip[:1], tip[rows[:-1] // 7 * 7]])
+    assert not repeated(late.round(4), steps).any()
     noisy = tip + np.random.default_rng(0).normal(0.0, 1e-4, tip.shape)
     for every in (2, 4, 7):
         seen = replace(log, tip_position=noisy[rows // every * every])

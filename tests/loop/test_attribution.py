@@ -153,8 +153,7 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
 @pytest.mark.parametrize("camera", ["slow", "coarse"])
 def test_a_camera_is_taken_for_what_it_is(camera: str) -> None:
     """One that sees every third row, which the others repeat, and one that says millimetres."""
-    log, _ = sealed("gravity")
-    tip = np.asarray(log.tip_position)
+    tip = np.asarray((log := sealed("gravity")[0]).tip_position)
     seen = tip[np.arange(len(tip)) // 3 * 3] if camera == "slow" else tip.round(3)
     result = identify(replace(log, tip_position=seen), robot(), threads=1)
     assert [effect.name for effect in result.effects] == ["gravity"]

@@ -196,8 +196,7 @@ def test_client_is_taken_as_users_have_it():
     assert Bullet(Bullet(client)).connection is Bullet(client._client).connection
     pybullet.disconnect(world.number)
     next_one = BulletClient(pybullet.DIRECT)  # of the same number
-    assert Bullet(next_one).isConnected()
-    assert not world.isConnected()
+    assert (Bullet(next_one).isConnected(), world.isConnected()) == (1, 0)
     if pybullet.isConnected(0):
         assert Bullet(pybullet).number == 0
 

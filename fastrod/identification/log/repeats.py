@@ -75,7 +75,10 @@ def repeated(tip: Floats, commands: Floats) -> Flags:
     step = float(np.linalg.norm(resolution(tip)))
     clear = (went > 0.0) & (jump > _CLEAR * step)
     held = clear & (ends - before > 1)
-    late, usual = jump[held] / went[held], jump[clear & ~held] / went[clear & ~held]
+    going = np.cumsum(np.diff(commands, axis=0, prepend=commands[:1]).any(axis=1))
+    # after a rest a robot that is late repeats, too
+    sure = held & (going[ends] - going[before] == ends - before)
+    late, usual = jump[sure] / went[sure], jump[clear & ~held] / went[clear & ~held]
     # a tip that is rounded may be the same by chance, once or twice
     few = not len(late) or len(late) + len(usual) * (not step) < _FEW
     if few or (len(usual) > len(late) and np.median(late) < _CAUGHT_UP * np.median(usual)):
