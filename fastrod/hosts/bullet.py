@@ -100,8 +100,8 @@ class Bullet:
 
     def disconnect(self) -> None:
         """End this world. `HostError` where it has ended before."""
-        end = getattr(self.connection.client, "disconnect", None)  # which forgets its number, too
-        end() if end is not None else _bound(self.connection, pybullet().disconnect, pybullet())()
+        client_ends = getattr(self.connection.client, "disconnect", None)  # a client forgets its number, too
+        (client_ends or _bound(self.connection, pybullet().disconnect, pybullet()))()
         self.connection.lose()
 
     @property

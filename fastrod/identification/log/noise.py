@@ -18,7 +18,6 @@ _LEAST = 8  # samples of a stretch at rest
 ENOUGH = 30  # samples at rest from which a noise is believed
 _WINDOW = 7  # samples either side, of the Hampel filter
 _OUTLIER = 5.0  # sigma
-_FINE = 0.5  # sigma: a tip that is rounded to less is as good as not rounded
 _LONG_SETTLE = 3.0  # s, where what is seen at rest is slow: creep and ringing are no noise
 _LONG_ENOUGH = 90  # samples that must be left then
 _TO_SIGMA = 1.4826  # of a median absolute deviation
@@ -99,10 +98,11 @@ def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a
     `residual` where the robot never rests; no less than what its digits leave out."""
     found, step = _read_noise(samples, tip, residual), resolution(np.asarray(samples.log.tip_position))
-    if (step <= _FINE * found.sigma).all():
+    coarse = step > found.sigma
+    if not coarse.any():
         return found
     # values that are mostly equal say nothing of what rounding did: they may be anywhere in their step
-    spread = np.random.default_rng(0).uniform(-0.5, 0.5, tip.shape) * step
+    spread = np.random.default_rng(0).uniform(-0.5, 0.5, tip.shape) * np.where(coarse, step, 0.0)
     found = _read_noise(samples, tip + spread, residual + spread)
     return replace(found, how=f"{found.how}; the tip is rounded to {1e3 * step.max():.3g} mm")
 

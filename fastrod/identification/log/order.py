@@ -19,7 +19,7 @@ from fastrod.types import Floats, Ints
 
 _BEND = 0.2  # rad, by which the model is bent for its answers
 _STARTS, _ROUNDS = 300, 5  # of the rotations of segments, drawn; of matching from each
-_ALIKE = 1.05  # times what the best signs leave
+_ALIKE, _EQUAL = 1.05, 1e-3  # times what the best signs leave, and beyond
 _SEEN = 1e-3  # of the largest singular value: directions of the commands that are as small say nothing
 
 
@@ -63,7 +63,9 @@ def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> Column
         each = [(one, _matched(one * measured, model, segment, still)) for one in (1.0, -1.0)]
         # two tendons across from each other answer alike with opposite signs: drives of both signs are rare
         alike = [
-            replace(m, sign=one * m.sign, answer=measured) for one, m in each if m.left < _ALIKE * free.left
+            replace(m, sign=one * m.sign, answer=measured)
+            for one, m in each
+            if m.left < _ALIKE * free.left + _EQUAL
         ]
         moved = [np.count_nonzero(m.order != np.arange(len(m.order))) - m.sign[0] for m in alike]
         return alike[int(np.argmin(moved))] if alike else free
