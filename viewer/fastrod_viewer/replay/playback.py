@@ -130,9 +130,12 @@ class Playback:
         if frames < 2:
             raise InputError(f"frames is {frames!r}; a playback keeps 2 at least.")
         samples = _samples(log)
+        repeated = log.measured[samples.origin] & ~samples.log.measured  # by a camera that is slower
+        shown = np.flatnonzero(~repeated[samples.given])
         log, n = samples.log.rows(samples.given), len(samples.given)
         time, breaks = _clock(log)
-        kept = np.arange(n) if n <= frames else np.linspace(0, n - 1, frames).round().astype(np.int64)
+        most = min(frames, len(shown))
+        kept = shown[np.linspace(0, len(shown) - 1, most).round().astype(np.int64)]
         robots = [before] if after is None else [before, after]
         tracks = []
         each = n + len(kept)
