@@ -31,7 +31,7 @@ from fastrod.identification.search.model_selection import (
 from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
 from fastrod.identification.search.search import MOST_OF, Search, SearchOutcome, lost_with_it
-from fastrod.identification.search.solve import Estimate, Fit, covariance, rms
+from fastrod.identification.search.solve import BEYOND, Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import SLACK, OneSidedTendons
 from fastrod.logs.runlog import RunLog
@@ -542,18 +542,23 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     for u, number, error, mean, prior, at in zip(
         model.unknowns, fit.theta[:n], stderr, *model.prior, fit.at_bound, strict=False
     ):
-        value = u.inside(float(number))
+        value, distance = u.inside(float(number)), float((number - mean) / prior)
         seen = bool(error < SEEN * prior)
+        why = (
+            "the data pull it beyond its prior and hardly say how far"
+            if abs(distance) > BEYOND
+            else "the data narrow its prior by less than a third"
+        )
         made[u.name] = Estimate(
             value=value,
             stderr=float(error * value if u.log else error),
             unit=u.unit,
             identifiable=seen,
-            why="" if seen else "the data narrow its prior by less than a third",
+            why="" if seen else why,
             at_bound=at,
             prior_sd=float(prior * value if u.log else prior),
             prior_mean=u.inside(float(mean)),
-            prior_distance=float((number - mean) / prior),
+            prior_distance=distance,
         )
     spread = np.where(stderr > 0.0, stderr, 1.0)
     return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
