@@ -245,8 +245,8 @@ class Rod:
         lost, one was lost before it had a shape, or 25 steps in a row could not be solved of any rod; then
         nothing has moved.
         """
-        motion, n = self._motion(base_pose, base_twist), self._substeps(time_step)
-        freedom = self._freedom(inverse_inertia, free_twist, motion)
+        n = self._substeps(time_step)
+        motion, freedom = self._bases(base_pose, base_twist, inverse_inertia, free_twist)
         n = n if freedom is None else 1
         given, around = self._sorted(inputs)
         start, dt = self.snapshot(), self.simulator.dt
@@ -387,9 +387,12 @@ class Rod:
             turned = quaternion_from_matrix(state.rotation[:, 0])
             base = np.concatenate([state.position[:, 0], turned], axis=1)
         again = ~state.ok & (state.passes != 0) & (self._failed >= _PATIENCE)
+        felt = state.base_wrench if state.mean_wrench is None else state.mean_wrench
         if again.any():
             state = self._anew(again, base, given, around)
         self._keep(state, given, around, base, half)
+        if again.any():  # the others felt what they did in their step
+            self._wrench = np.where((state.ok & ~again)[:, None], felt, self._wrench)
         self._failed = np.where(state.ok, 0, self._failed + 1)
         if (self._failed > _MOST_FAILED).all():
             why = next(iter(state.problems.values()), "no reason is known.")
@@ -496,6 +499,19 @@ class Rod:
             )
         return n
 
+    def _bases(self, *given: ArrayLike | None) -> tuple[Motion, Freedom | None]:
+        """Motion of the bases, and how they give way. The pose of one of several that an engine lost is nan:
+        its step says so."""
+        lost = np.zeros(self.simulator.n_robots, bool)
+        shapes = (np.array([0, 0, 0, 1, 0, 0, 0]), np.zeros(6), np.zeros((6, 6)), np.zeros(6))
+        usable = [_usable(*pair, lost) for pair in zip(given, shapes, strict=True)]
+        pose, twist, inertia, free_twist = given if lost.all() else usable
+        assert pose is not None
+        assert twist is not None
+        motion = self._motion(pose, twist)
+        freedom = self._freedom(inertia, free_twist, motion)
+        return motion._replace(pose=np.where(lost[: len(motion.pose), None], np.nan, motion.pose)), freedom
+
     def _motion(self, base_pose: ArrayLike, base_twist: ArrayLike) -> Motion:
         """(1 or n_robots, 7 and 6)"""
         pose, twist = np.atleast_2d(self._poses(base_pose)), np.atleast_2d(self._twists(base_twist))
@@ -536,6 +552,17 @@ class Rod:
         if what is None:
             raise InputError("the rod has no state yet; call advance or settle first.")
         return what
+
+
+def _usable(value: ArrayLike | None, instead: Floats, lost: Flags) -> ArrayLike | None:
+    """Rows (n, ...) with something `instead` of those that are not finite, which are noted as `lost` (n,);
+    anything else as it is."""
+    if type(value) is not np.ndarray or value.shape != (len(lost), *instead.shape) or value.dtype.kind != "f":
+        return value
+    axes = tuple(range(1, value.ndim))
+    bad = ~np.isfinite(value).all(axis=axes)
+    lost |= bad
+    return np.where(np.expand_dims(bad, axes), instead, value)
 
 
 def _copied(value: Any) -> Any:

@@ -143,7 +143,7 @@ class ModalRods:
                 tip, other = found.shape.tip_position, self._room(True)
                 self._errors = stepper.errors(warm[ok[warm]], inputs, jump, start, tip, other)
         modal.host = no_hosts()
-        return self._solved(found, ok, self._moved_bases(ports, found))
+        return self._solved(rows, found, ok, self._moved_bases(ports, found))
 
     def settle(self, rows: Ints, acting: Acting, last: Last, tolerance: float) -> Solved:
         """Bring these robots to rest, to `tolerance` [m] at the tip."""
@@ -151,9 +151,9 @@ class ModalRods:
         found, ok = self._room(len(rows) < self.n_robots), np.zeros(self.n_robots, bool)
         ok[rows] = self.stepper.rest(rows, rows[~last.warm[rows]], acting.ports, found, tolerance)
         self._errors = self._host = None
-        return self._solved(found, ok, acting.ports)
+        return self._solved(rows, found, ok, acting.ports)
 
-    def _solved(self, found: PassShapes, ok: Flags, ports: Ports) -> Solved:
+    def _solved(self, rows: Ints, found: PassShapes, ok: Flags, ports: Ports) -> Solved:
         if self.tape is not None:
             if self.stepper.divided:
                 self.tape.broken = "a robot took shorter steps in this recording; give a smaller dt."
@@ -163,8 +163,9 @@ class ModalRods:
         mean = None if self._host is None else self._host.wrench.copy()
         moving = {name: getattr(found.motion, name) for name in MOVING}
         moving |= {"step_error": self._errors, "mean_wrench": mean}
-        iterations = np.where(ok, np.abs(self.modal.iterations), -1)
-        return Solved(found.shape, ok, iterations, ports, reason, Problem.NOT_CONVERGED, moving=moving)
+        passes = np.zeros(self.n_robots, np.int64)
+        passes[rows] = np.where(ok[rows], np.abs(self.modal.iterations[rows]), -1)
+        return Solved(found.shape, ok, passes, ports, reason, Problem.NOT_CONVERGED, moving=moving)
 
     def _moved_bases(self, ports: Ports, found: PassShapes) -> Ports:
         """The ports with bases where the bodies have come to."""

@@ -155,8 +155,8 @@ class TouchingRods(ModalRods):
     def end(self, rows: Ints, ok: Flags, found: PassShapes, acting: Acting, last: Last) -> Solved:
         """The state, with what has stopped those that are not ok; they go on from where they were."""
         self.engine.end_step(ok.astype(float))
-        solved = self._solved(found, ok, self._moved_bases(acting.ports, found))
-        passes, problems = np.where(ok, np.maximum(self._passes, 1), -1), {}
+        solved = self._solved(rows, found, ok, self._moved_bases(acting.ports, found))
+        passes, problems = np.where(ok, np.maximum(self._passes, 1), solved.passes), {}
         lost = rows[~ok[rows]]
         last_shape, folds = self.engine.before, np.zeros(self.n_robots)
         if len(lost) and last_shape is not None:
