@@ -181,9 +181,10 @@ class Simulator(RobotBatch):
         input is usable; a single bad row only clears that robot's `ok`.
 
         With a contact scene: `obstacle_pose` name -> (7,) or (n_robots, 7) position and quaternion, world;
-        what is not given stays where it was. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s]
-        and angular [rad/s] velocity of the obstacle's origin: slip is then counted by it, and not by how the
-        pose has changed. Robots that touch something take as many passes as bring contact and boundary to
+        what is not given stays where it was, and what is not finite is refused for all robots, who may share
+        it. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s] and angular [rad/s] velocity of the
+        obstacle's origin: slip is then counted by it, and not by how the pose has changed. Robots that touch
+        something take as many passes as bring contact and boundary to
         rest; `state.contacts` reports them.
 
         `inverse_inertia` (6, 6) or (n_robots, 6, 6), with `dynamics`: of the free body that carries the base,

@@ -53,7 +53,7 @@ def sentences(log: RunLog) -> list[str]:
     n = every - int(fresh(log).measured.sum())
     said = (
         f"{n} of {every} rows repeat the measured tip of the row before while the commands go on: the camera "
-        "is slower than the log, and they do not count"
+        "is slower than the log, and they do not count; a row for each picture, at its time, would say more"
     )
     return [said] * (n > _SOME * every)
 
