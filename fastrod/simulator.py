@@ -184,8 +184,7 @@ class Simulator(RobotBatch):
         what is not given stays where it was, and what is not finite is refused for all robots, who may share
         it. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s] and angular [rad/s] velocity of the
         obstacle's origin: slip is then counted by it, and not by how the pose has changed. Robots that touch
-        something take as many passes as bring contact and boundary to
-        rest; `state.contacts` reports them.
+        something take as many passes as bring contact and boundary to rest; `state.contacts` reports them.
 
         `inverse_inertia` (6, 6) or (n_robots, 6, 6), with `dynamics`: of the free body that carries the base,
         its linear and angular acceleration by force and moment about the base point, world (J M^-1 J^T; 0 of
