@@ -207,7 +207,7 @@ def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law:
         assert sentences(replace(log, tip_position=seen)) == []
     steps = log.dl[rows // 7 * 7]  # which are held, and a tip that is late
     late = np.concatenate([tip[:1], tip[rows[:-1] // 7 * 7]])
-    assert not repeated(late.round(4), steps).any()
+    assert not repeated(late.round(4), steps, steps).any()
     noisy = tip + np.random.default_rng(0).normal(0.0, 1e-4, tip.shape)
     for every in (2, 4, 7):
         seen = replace(log, tip_position=noisy[rows // every * every])

@@ -34,7 +34,7 @@ def fresh(log: RunLog) -> RunLog:
     old, measured = np.zeros(len(log), dtype=np.bool_), log.measured
     for label in log.runs:
         rows = np.flatnonzero(measured & (log.run == label))
-        old[rows] = repeated(np.asarray(log.tip_position)[rows], log.commands[rows])
+        old[rows] = repeated(np.asarray(log.tip_position)[rows], log.commands[rows], log.inputs[rows])
 
     def without(seen: Floats) -> Floats:
         return np.where(old.reshape(-1, *[1] * (seen.ndim - 1)), np.nan, seen)
@@ -58,9 +58,9 @@ def sentences(log: RunLog) -> list[str]:
     return [said] * (n > _SOME * every)
 
 
-def repeated(tip: Floats, commands: Floats) -> Flags:
+def repeated(tip: Floats, commands: Floats, inputs: Floats) -> Flags:
     """(n,) rows of a run in which the measured `tip` (n, 3) [m] is that of the row before, for the camera has
-    seen nothing since, while the `commands` (n, m) went on.
+    seen nothing since, while the `inputs` (n, k) went on, of which the `commands` (n, m) are some.
 
     What it sees next is as far away as the commands have gone since it saw something. That of a robot that
     stands still by friction or backlash is not, and that of one whose tip is rounded is next to it.
@@ -73,15 +73,16 @@ def repeated(tip: Floats, commands: Floats) -> Flags:
     jump = np.linalg.norm(tip[ends] - tip[before], axis=1)
     went = np.linalg.norm(commands[ends] - commands[before], axis=1)
     step = float(np.linalg.norm(resolution(tip)))
-    clear = (went > 0.0) & (jump > _CLEAR * step)
+    clear = jump > _CLEAR * step
     held = clear & (ends - before > 1)
-    going = np.cumsum(np.diff(commands, axis=0, prepend=commands[:1]).any(axis=1))
+    going, moved = (np.cumsum(np.diff(a, axis=0, prepend=a[:1]).any(axis=1)) for a in (commands, inputs))
     # after a rest a robot that is late repeats, too
-    sure = held & (going[ends] - going[before] == ends - before)
-    late, usual = jump[sure] / went[sure], jump[clear & ~held] / went[clear & ~held]
+    sure = held & (went > 0.0) & (going[ends] - going[before] == ends - before)
+    once = clear & (went > 0.0) & ~held
+    late, usual = jump[sure] / went[sure], jump[once] / went[once]
     # a tip that is rounded may be the same by chance, once or twice
     few = not len(late) or len(late) + len(usual) * (not step) < _FEW
     if few or (len(usual) > len(late) and np.median(late) < _CAUGHT_UP * np.median(usual)):
         return np.zeros(len(tip), dtype=np.bool_)
     slow = np.isin(seen, [*before[held].tolist(), seen[-1]])  # what the last one would be is not known
-    return np.asarray(slow & (commands != commands[seen]).any(axis=1))
+    return np.asarray(slow & (moved > moved[seen]))
