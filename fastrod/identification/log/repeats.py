@@ -52,8 +52,8 @@ def sentences(log: RunLog) -> list[str]:
     every = int(log.measured.sum())
     n = every - int(fresh(log).measured.sum())
     said = (
-        f"{n} of {every} rows repeat the measured tip of the row before while the commands go on: the camera "
-        "is slower than the log, and they do not count; a row for each picture, at its time, would say more"
+        f"{n} of {every} rows repeat the measured tip of the row before, whatever the commands do: the "
+        "camera is slower than the log, and they do not count; a row for each picture, at its time, says more"
     )
     return [said] * (n > _SOME * every)
 
@@ -84,5 +84,7 @@ def repeated(tip: Floats, commands: Floats, inputs: Floats) -> Flags:
     few = not len(late) or len(late) + len(usual) * (not step) < _FEW
     if few or (len(usual) > len(late) and np.median(late) < _CAUGHT_UP * np.median(usual)):
         return np.zeros(len(tip), dtype=np.bool_)
+    if not step:  # no two measurements are the same, at rest neither
+        return ~new
     slow = np.isin(seen, [*before[held].tolist(), seen[-1]])  # what the last one would be is not known
     return np.asarray(slow & (moved > moved[seen]))

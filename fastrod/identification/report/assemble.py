@@ -46,6 +46,8 @@ _MOST_ADVICE = 5  # runs
 _FALLS = 0.97
 _DRAWN = 3  # rivals of an effect
 _MANY = 0.005  # of the rows: so many outliers are worth a note
+_PULL = "pull it beyond its prior and hardly say how far"
+_NARROW = "narrow its prior by less than a third"
 _MOST_SPOKEN = 4  # other names of an effect
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
 _NEAR = 1.1  # of the noise: a held-out error within it is explained
@@ -544,17 +546,12 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     ):
         value, distance = u.inside(float(number)), float((number - mean) / prior)
         seen = bool(error < SEEN * prior)
-        why = (
-            "the data pull it beyond its prior and hardly say how far"
-            if abs(distance) > BEYOND
-            else "the data narrow its prior by less than a third"
-        )
         made[u.name] = Estimate(
             value=value,
             stderr=float(error * value if u.log else error),
             unit=u.unit,
             identifiable=seen,
-            why="" if seen else why,
+            why="" if seen else f"the data {_PULL if abs(distance) > BEYOND else _NARROW}",
             at_bound=at,
             prior_sd=float(prior * value if u.log else prior),
             prior_mean=u.inside(float(mean)),
