@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CORES = 2
 # xdist waits for ever for what a worker that died had left
-TWICE = ["-n", str(CORES), "--dist", "loadfile", "--max-worker-restart", "0"]
+PARALLEL = ["-n", str(CORES), "--dist", "loadfile", "--max-worker-restart", "0"]
 # Threads of torch and of numpy's BLAS that spin while they wait take the cores from those they wait for: a
 # training takes eight times as long on two busy cores, and a test twice. Those of the kernels sleep by
 # themselves, and what fastrod does with BLAS it does on one thread; what tests compute for comparison is not.
@@ -45,7 +45,7 @@ class Job(NamedTuple):
 
 def tests(which: str, *more: str) -> Job:
     """The tests of these marks, on both cores."""
-    return Job("tests", ["pytest", *TWICE, "-m", which, *more], SLEEPY, alone=True)
+    return Job("tests", ["pytest", *PARALLEL, "-m", which, *more], SLEEPY, alone=True)
 
 
 def real_time(which: str) -> Job:

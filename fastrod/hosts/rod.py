@@ -36,6 +36,8 @@ Given = dict[str, Any]  # inputs by name
 _PATIENCE = 2  # steps that fail before a rod in contact settles anew
 _MOST_FAILED = 25
 _MOST_SUBSTEPS = 100_000
+# pose, velocity, inverse inertia and free velocity of a base whose own are of no use
+_STANDS = (np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros((6, 6)), np.zeros(6))
 
 
 class RodSnapshot(NamedTuple):
@@ -499,23 +501,20 @@ class Rod:
             )
         return n
 
-    def _bases(self, *given: ArrayLike | None) -> tuple[Motion, Freedom | None]:
+    def _bases(self, *given: Any) -> tuple[Motion, Freedom | None]:
         """Motion of the bases, and how they give way. The pose of one of several that an engine lost is nan:
         its step says so."""
         lost = np.zeros(self.simulator.n_robots, bool)
-        shapes = (np.array([0, 0, 0, 1, 0, 0, 0]), np.zeros(6), np.zeros((6, 6)), np.zeros(6))
-        usable = [_usable(*pair, lost) for pair in zip(given, shapes, strict=True)]
+        usable = [_usable(*pair, lost) for pair in zip(given, _STANDS, strict=True)]
         pose, twist, inertia, free_twist = given if lost.all() else usable
-        assert pose is not None
-        assert twist is not None
         motion = self._motion(pose, twist)
         freedom = self._freedom(inertia, free_twist, motion)
-        return motion._replace(pose=np.where(lost[: len(motion.pose), None], np.nan, motion.pose)), freedom
+        known = np.where(lost[:, None], np.nan, motion.pose) if lost.any() else motion.pose
+        return motion._replace(pose=known), freedom
 
     def _motion(self, base_pose: ArrayLike, base_twist: ArrayLike) -> Motion:
-        """(1 or n_robots, 7 and 6)"""
-        pose, twist = np.atleast_2d(self._poses(base_pose)), np.atleast_2d(self._twists(base_twist))
-        n = max(len(pose), len(twist))
+        """(n_robots, 7 and 6)"""
+        n, pose, twist = self.simulator.n_robots, self._poses(base_pose), self._twists(base_twist)
         return Motion(np.broadcast_to(pose, (n, 7)), np.broadcast_to(twist, (n, 6)))
 
     def _freedom(
@@ -554,7 +553,7 @@ class Rod:
         return what
 
 
-def _usable(value: ArrayLike | None, instead: Floats, lost: Flags) -> ArrayLike | None:
+def _usable(value: Any, instead: Floats, lost: Flags) -> Any:
     """Rows (n, ...) with something `instead` of those that are not finite, which are noted as `lost` (n,);
     anything else as it is."""
     if type(value) is not np.ndarray or value.shape != (len(lost), *instead.shape) or value.dtype.kind != "f":
@@ -562,7 +561,7 @@ def _usable(value: ArrayLike | None, instead: Floats, lost: Flags) -> ArrayLike 
     axes = tuple(range(1, value.ndim))
     bad = ~np.isfinite(value).all(axis=axes)
     lost |= bad
-    return np.where(np.expand_dims(bad, axes), instead, value)
+    return np.where(np.expand_dims(bad, axes), instead, value) if bad.any() else value
 
 
 def _copied(value: Any) -> Any:

@@ -216,18 +216,13 @@ def test_world_that_nobody_refers_to_ends_and_its_number_is_another_worlds():
     gone.step()
     other.removeBody(arm)
     box = MountedRod(rod.rod.robot, BulletLink(other, cube(other, 0.05, 0.1, [0.0, 0.0, 0.0])))
-    assert (other.number, box.host.body) == (
-        number,
-        arm,
-    )  # a cube has no link 6, which PyBullet does not check
+    # a cube has no link 6, which PyBullet does not check
+    assert (other.number, box.host.body) == (number, arm)
     for _ in range(3):
         assert box.step().ok[0]
     ended = rf"^PyBullet's world {number} has been disconnected\.$"
-    for call, why in (
-        (rod.step, ended),
-        (rod.bullet.disconnect, ended),
-        (gone.step, f"body {arm} has no link 6"),
-    ):
+    linkless = f"^body {arm} has no link 6"
+    for call, why in ((rod.step, ended), (rod.bullet.disconnect, ended), (gone.step, linkless)):
         with pytest.raises(HostError, match=why):
             call()
     del rod, gone, box, other, call

@@ -223,6 +223,9 @@ def test_rods_of_a_batch_give_way_each_by_itself() -> None:
         twist = free + dt * np.einsum("nij,nj->ni", mobility, every.wrench)
         pose = displaced(pose, dt * twist)
         assert k != 7 or np.abs(every.wrench[1, 2] + 0.2 * GRAVITY) < 0.05
+    given = {"inverse_inertia": mobility, "free_twist": 0.0 * free, "tendon_length": robot.rest_tendon_length}
+    every.advance(HOME, np.zeros(6), dt, **given)  # one base for all
+    assert every.state.ok.all()
 
 
 def test_wrong_inverse_inertia_is_a_sentence() -> None:

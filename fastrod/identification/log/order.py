@@ -59,7 +59,7 @@ def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> Column
     segment = np.asarray(robot.tendon_segment)
     if not sign:
         still = np.zeros(robot.n_segments)
-        free = _matched(measured, model, segment, still, signed=True)
+        free = _matched(measured, model, segment, still, free=True)
         each = [(one, _matched(one * measured, model, segment, still)) for one in (1.0, -1.0)]
         # two tendons across from each other answer alike with opposite signs: drives of both signs are rare
         alike = [
@@ -70,7 +70,7 @@ def column_order(samples: LogSamples, robot: Robot, sign: float = 0.0) -> Column
         moved = [np.count_nonzero(m.order != np.arange(len(m.order))) - m.sign[0] for m in alike]
         return alike[int(np.argmin(moved))] if alike else free
     starts = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, (_STARTS, robot.n_segments))
-    found = [_matched(sign * measured, model, segment, start, rotated=True) for start in starts]
+    found = [_matched(sign * measured, model, segment, start, fit=True) for start in starts]
     best = min(found, key=lambda each: each.left)
     return replace(best, sign=sign * best.sign, answer=measured)
 
@@ -107,26 +107,20 @@ def _answers(robot: Robot) -> Floats:
 
 
 def _matched(
-    measured: Floats,
-    model: Floats,
-    segment: Ints,
-    rotation: Floats,
-    *,
-    rotated: bool = False,
-    signed: bool = False,
+    measured: Floats, model: Floats, segment: Ints, rotation: Floats, *, fit: bool = False, free: bool = False
 ) -> ColumnOrder:
-    """The order that matches best near a `rotation` of each segment (n_segments,) [rad]; with `rotated` that
-    is fitted too, with `signed` each column may have its own sign."""
+    """The order that matches best near a `rotation` of each segment (n_segments,) [rad]; with `fit` that is
+    fitted too, with `free` each column may have its own sign."""
     tendon = np.arange(len(model))
-    for _ in range(_ROUNDS if rotated else 1):
+    for _ in range(_ROUNDS if fit else 1):
         c, s = np.cos(rotation[segment]), np.sin(rotation[segment])
         seen = np.stack(
             [c * model[:, 0] - s * model[:, 1], s * model[:, 0] + c * model[:, 1], model[:, 2]], 1
         )
         same, reverse = (((sign * measured[:, None] - seen) ** 2).sum(2) for sign in (1.0, -1.0))
-        apart = np.minimum(same, reverse) if signed else same
+        apart = np.minimum(same, reverse) if free else same
         order = linear_sum_assignment(apart.T)[1]
-        if rotated:
+        if fit:
             flat = measured[order, :2]
             across = seen[:, 0] * flat[:, 1] - seen[:, 1] * flat[:, 0]
             along = (seen[:, :2] * flat).sum(1)

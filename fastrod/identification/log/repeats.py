@@ -30,18 +30,20 @@ def resolution(values: Floats) -> Floats:
 
 
 def fresh(log: RunLog) -> RunLog:
-    """The log without what its camera repeats."""
-    old, measured = np.zeros(len(log), dtype=np.bool_), log.measured
+    """The log without what its camera repeats: tip, points and orientation are nan there."""
+    old, measured, commands, inputs = np.zeros(len(log), bool), log.measured, log.commands, log.inputs
     for label in log.runs:
         rows = np.flatnonzero(measured & (log.run == label))
-        old[rows] = repeated(np.asarray(log.tip_position)[rows], log.commands[rows], log.inputs[rows])
+        old[rows] = repeated(log.tip_position[rows], commands[rows], inputs[rows])
+    if not old.any():
+        return log
 
     def without(seen: Floats) -> Floats:
         return np.where(old.reshape(-1, *[1] * (seen.ndim - 1)), np.nan, seen)
 
     return replace(
         log,
-        tip_position=without(np.asarray(log.tip_position)),
+        tip_position=without(log.tip_position),
         tip_quaternion=None if log.tip_quaternion is None else without(log.tip_quaternion),
         points=None if log.points is None else without(log.points),
     )
@@ -60,10 +62,12 @@ def sentences(log: RunLog) -> list[str]:
 
 def repeated(tip: Floats, commands: Floats, inputs: Floats) -> Flags:
     """(n,) rows of a run in which the measured `tip` (n, 3) [m] is that of the row before, for the camera has
-    seen nothing since, while the `inputs` (n, k) went on, of which the `commands` (n, m) are some.
+    seen nothing since. Of a tip that is rounded, those alone in which any of the `inputs` (n, k) has moved
+    since, of which the `commands` (n, m) are some.
 
-    What it sees next is as far away as the commands have gone since it saw something. That of a robot that
-    stands still by friction or backlash is not, and that of one whose tip is rounded is next to it.
+    What such a camera sees next is as far away as the commands have gone since it saw something. That of a
+    robot that stands still by friction or backlash is not, and that of one whose tip is rounded is next to
+    it.
     """
     rows, new = np.arange(len(tip)), np.ones(len(tip), dtype=np.bool_)
     new[1:] = (tip[1:] != tip[:-1]).any(axis=1)
