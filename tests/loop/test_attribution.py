@@ -150,15 +150,18 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
 
 
 @pytest.mark.study
-@pytest.mark.parametrize("camera", ["slow", "coarse"])
-def test_a_camera_is_taken_for_what_it_is(camera: str) -> None:
-    """One that sees every third row, which the others repeat, and one that says millimetres."""
+@pytest.mark.parametrize(("camera", "every"), [("slow", 3.0), ("out of step", 1.618), ("coarse", 1.0)])
+def test_a_camera_is_taken_for_what_it_is(camera: str, every: float) -> None:
+    """One whose pictures come every third row, or every 1.618 rows, and one that says millimetres."""
     tip = np.asarray((log := sealed("gravity")[0]).tip_position)
-    seen = tip[np.arange(len(tip)) // 3 * 3] if camera == "slow" else tip.round(3)
+    rows = np.arange(len(tip))
+    seen = np.stack([np.interp(rows // every * every, rows, x) for x in tip.T], axis=1)
+    seen = seen.round(3) if camera == "coarse" else seen
     result = identify(replace(log, tip_position=seen), robot(), threads=1)
     assert [effect.name for effect in result.effects] == ["gravity"]
     assert result.test.after < 1.15 * result.noise.floor
-    assert ("repeat the measured tip" in "".join(result.notes)) == (camera == "slow")
+    assert ("repeat the measured tip" in "".join(result.notes)) == (camera != "coarse")
+    assert ("out of step" in "".join(result.notes)) == (camera == "out of step")
 
 
 @pytest.mark.study

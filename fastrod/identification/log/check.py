@@ -79,7 +79,7 @@ def check(log: RunLog | str | Path, robot: Robot | str | Path, *, threads: int |
     bend = wiring.of_sections(wiring.bend(samples.log.pulls))
     said = excitation(samples, bend)
     return LogCheck(
-        facts=_facts(samples, robot, bend, left),
+        facts=_facts(log, samples, robot, bend, left),
         refusal=reading.refusal,
         questions=(*questions, *(each for each in reading.questions if each != reading.refusal)),
         shows=tuple(can for there, can, _ in said if there),
@@ -154,15 +154,14 @@ def _with_columns(robot: Robot, columns: ColumnOrder) -> Robot:
     return replace(robot, log=made)
 
 
-def _facts(samples: LogSamples, robot: Robot, bend: Floats, left: float) -> dict[str, str]:
+def _facts(given: RunLog, samples: LogSamples, robot: Robot, bend: Floats, left: float) -> dict[str, str]:
     log, tip = samples.log, np.asarray(samples.log.tip_position)[samples.rows]
-    step = float(np.median(samples.dt[samples.dt > 0.0])) if samples.dt.any() else float("nan")
-    gaps = len(samples.log) - len(samples.given)
+    gaps = int((samples.log.t > given.t[samples.origin]).sum())
     lasts = sum(float(samples.time[span.stop - 1]) for span in samples.runs)
     runs = f"{len(samples.runs)} run{'s' if len(samples.runs) > 1 else ''}"
     facts = {
         "rows": f"{len(samples.given)} in {runs}, {len(samples.rows)} of them measured; {lasts:.0f} s, one "
-        f"every {step:.3g} s"
+        f"every {samples.step:.3g} s"
         + (f"; {gaps} gap{'s' if gaps > 1 else ''} in time, read as holds" if gaps else "")
     }
     if robot.n_tendons:

@@ -35,7 +35,7 @@ from fastrod.effects.executor import (
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
-from fastrod.identification.log.repeats import fresh
+from fastrod.identification.log.repeats import earlier, fresh, lateness, unmeasured
 from fastrod.identification.log.unknowns import Model
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog
@@ -80,7 +80,8 @@ class LogSamples:
     log: RunLog
     """Only driven rows that have a time."""
     origin: Ints
-    """(n,) their rows in the log that was given; of the end of a gap that of the row before it."""
+    """(n,) their rows in the log that was given; of the end of a gap that of the row before it. A row whose
+    picture was taken before it is two: one at the time of the picture, and one that is not measured."""
     rows: Ints
     """(n_rows,) samples that are solved and compared."""
     runs: tuple[slice, ...]
@@ -93,10 +94,12 @@ class LogSamples:
     """(n,) number of each sample's session."""
     sessions: tuple[str, ...]
     """Their labels, that of most samples first; ("",) of a log without."""
+    step: float
+    """Usual time from one row of the log to the next [s]; 0 where no two have times of their own."""
 
     @property
     def given(self) -> Ints:
-        """Samples that are rows of the log, and not the ends of gaps."""
+        """Samples that stand for rows of the log, measured ones for their pictures; not the ends of gaps."""
         return np.flatnonzero(np.diff(self.origin, prepend=-1))
 
     @property
@@ -122,6 +125,9 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
     ordered, order = _held(log.rows(order), order)
+    steps = np.diff(ordered.t)[ordered.run[1:] == ordered.run[:-1]]
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    ordered, order = _pictured(ordered, order)
     starts = np.flatnonzero(np.concatenate([[True], ordered.run[1:] != ordered.run[:-1]]))
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
@@ -150,7 +156,22 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
         dt,
         np.argsort(largest_first)[number],
         tuple(labels[largest_first].tolist()),
+        usual,
     )
+
+
+def _pictured(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
+    """The log with each picture that had waited for its row in one of its own, before that row."""
+    late = lateness(log)[0]
+    rows = np.flatnonzero(late)
+    if not len(rows):
+        return log, order
+    both = np.insert(np.arange(len(log)), rows, rows)
+    pictures = rows + np.arange(len(rows))
+    waits, own = np.zeros(len(both)), np.zeros(len(both), bool)
+    waits[pictures], own[pictures + 1] = late[rows], True
+    made = earlier(log.rows(both), waits, np.arange(len(both)) - 1)
+    return unmeasured(made, own), order[both]
 
 
 def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:

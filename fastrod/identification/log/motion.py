@@ -251,12 +251,11 @@ class _Clock:
 
 
 def _clock(samples: LogSamples, runs: list[slice], longest: float) -> _Clock:
-    usual = samples.dt[samples.dt > 0.0]
-    if not len(usual):
+    middle = samples.step
+    if not middle:
         raise LogError(
             f"log {samples.log.name!r} has no two samples at different times; nothing moves in it."
         )
-    middle = float(np.median(usual))
     dt = middle / math.ceil(middle / longest - 1e-9)
     at = samples.time[samples.rows] / dt
     even = bool((np.abs(at - np.rint(at)) < _ON_STEP * np.maximum(1.0, np.rint(at) * 1e-3)).all())

@@ -116,7 +116,7 @@ def _read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
             "third differences of the residual; the robot never rests, so slow noise cannot be seen",
         )
     n = sum(len(p) for p in pieces)
-    period = _period(samples)
+    period = samples.step or 1.0
     found = _read(samples, tip, pieces, period)
     how = f"{n} samples at rest"
     if found.model.order:
@@ -162,12 +162,6 @@ def read_everywhere(samples: LogSamples, residual: Floats, noise: Noise) -> Nois
                 noise, sigma=sigma, lag1=lag1, how=how, model=found.model, uncertainty=found.uncertainty
             )
     return replace(noise, sigma=np.minimum(noise.sigma, size))
-
-
-def _period(samples: LogSamples) -> float:
-    """Time from one sample to the next [s]."""
-    steps = samples.dt[samples.dt > 0.0]
-    return float(np.median(steps)) if len(steps) else 1.0
 
 
 def _read(

@@ -107,7 +107,7 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
     """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
     late = "" if "time" in robot.log.units else time_question(samples)
     questions = [late] if late else []
-    wrong = late if _pace(samples) >= _SLOWEST else ""
+    wrong = late if samples.step >= _SLOWEST else ""
     look = _Look(samples, robot, threads)
     nothing = Reading(registration=None, questions=tuple(questions), refusal=wrong, guess="")
     frame, far = look.frame, look.frame.is_large(robot.length)
@@ -195,7 +195,7 @@ def further_than_still(samples: LogSamples, robot: Robot, scale: float, guess: s
 
 def time_question(samples: LogSamples) -> str:
     """Whether the time of a dense log is in another unit; empty where it is not."""
-    tip, pace = np.asarray(samples.log.tip_position)[samples.rows], _pace(samples)
+    tip, pace = np.asarray(samples.log.tip_position)[samples.rows], samples.step
     if len(tip) < _LEAST:
         return ""
     motion = size(tip - np.median(tip, axis=0))
@@ -206,12 +206,6 @@ def time_question(samples: LogSamples) -> str:
         f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes "
         'seconds, or [log] units = {time = "ms"} in the robot file, and "s" where it is so slow.'
     )
-
-
-def _pace(samples: LogSamples) -> float:
-    """Median time from row to row [s]; 0 where too few tell."""
-    steps = samples.dt[samples.dt > 0.0]
-    return float(np.median(steps)) if len(steps) >= _LEAST else 0.0
 
 
 class _Look:

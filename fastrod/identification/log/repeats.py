@@ -1,4 +1,4 @@
-"""Rows of a log that no sensor measured: those of a camera that is slower than the log repeat."""
+"""Pictures of a camera that is slower than the log: rows that repeat them, and when they were taken."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fastrod.logs.runlog import RunLog
-from fastrod.types import Flags, Floats
+from fastrod.types import Flags, Floats, Ints
 
 _FINEST = 1e-9  # m; less between two values is rounding
 _WHOLE = 0.01  # of a step of the resolution, by which values may be off it
@@ -15,6 +15,10 @@ _CLEAR = 3.0  # steps of the resolution: less is no jump
 _FEW = 10  # jumps, and values of a column
 _SOME = 0.005  # of the rows: less is not worth a sentence
 _CAUGHT_UP = 0.75  # of how far the tip usually goes with the commands
+_EVEN = 0.2  # of the usual step, by which rows come early or late
+_SURE = 40  # pictures: fewer may come evenly by chance
+_WAITS = 0.01, 0.4  # steps, rms, of pictures that come evenly: 0.29, and some are late themselves
+_CLOCK = 0.23  # of the time between two pictures, rms; any times are off a clock by 0.29 of it
 
 
 def resolution(values: Floats) -> Floats:
@@ -34,12 +38,17 @@ def fresh(log: RunLog) -> RunLog:
     old, measured, commands, inputs = np.zeros(len(log), bool), log.measured, log.commands, log.inputs
     for label in log.runs:
         rows = np.flatnonzero(measured & (log.run == label))
-        old[rows] = repeated(log.tip_position[rows], commands[rows], inputs[rows])
-    if not old.any():
-        return log
+        tip, new = log.tip_position[rows], _new(log.tip_position[rows])
+        even = _waits(log.t[rows], np.flatnonzero(new)).any()  # no robot stands still by the clock
+        old[rows] = ~new if even else repeated(tip, commands[rows], inputs[rows])
+    return unmeasured(log, old) if old.any() else log
+
+
+def unmeasured(log: RunLog, rows: Flags) -> RunLog:
+    """The log as if its camera had seen nothing in these `rows` (n,)."""
 
     def without(seen: Floats) -> Floats:
-        return np.where(old.reshape(-1, *[1] * (seen.ndim - 1)), np.nan, seen)
+        return np.where(rows.reshape(-1, *[1] * (seen.ndim - 1)), np.nan, seen)
 
     return replace(
         log,
@@ -49,15 +58,90 @@ def fresh(log: RunLog) -> RunLog:
     )
 
 
+def lateness(log: RunLog) -> tuple[Floats, Ints]:
+    """(n,) for how long the picture in each row of a `fresh` log had waited for it [s], and the driven row
+    (n,) before each in its run.
+
+    A camera that takes pictures evenly, out of step with rows that are even, too, gives each to the next row:
+    the waits are what the rows' times have beyond an even clock. They are 0 where there is no such clock; of
+    all alike nothing is known.
+    """
+    late, before, measured = np.zeros(len(log)), np.arange(len(log)), log.measured
+    used = log.driven & np.isfinite(log.t)
+    for label in log.runs:
+        rows = np.flatnonzero(used & (log.run == label))
+        before[rows[1:]] = rows[:-1]
+        seen = np.flatnonzero(measured[rows])
+        late[rows[seen]] = _waits(log.t[rows], seen)
+    return late, before
+
+
+def _waits(t: Floats, seen: Ints) -> Floats:
+    """(k,) how long the pictures in the rows `seen` (k,) of those at `t` (n,) had waited [s]."""
+    none, steps, at = np.zeros(len(seen)), np.diff(t), t[seen]
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if len(seen) < _SURE or usual <= 0.0 or at[-1] - at[0] < (len(seen) - 1 + _FEW) * usual:
+        return none
+    if np.quantile(np.abs(steps - usual), 0.9) > _EVEN * usual:
+        return none
+    for number in (np.arange(len(at)), _numbers(at, usual)):
+        each, first = np.polyfit(number, at, 1)
+        off = at - each * number - first
+        most = min(_WAITS[1] * usual, _CLOCK * each if number[-1] >= len(at) else np.inf)
+        if _WAITS[0] * usual < off.std() < most:
+            waits = np.clip(off + 0.5 * usual, 0.0, 0.98 * np.diff(t, prepend=t[0])[seen])
+            return np.asarray(waits, dtype=np.float64)
+    return none
+
+
+def _numbers(at: Floats, least: float) -> Ints:
+    """(k,) numbers of the pictures that came `at` these times, `least` apart [s]; some never came."""
+    apart, n = np.diff(at), _SURE
+    period = max(least, apart[apart <= 1.5 * np.median(apart)].mean())
+    number = np.cumsum(np.append(0.0, np.maximum(np.round(apart / period), 1.0)))
+    while n < 2 * len(at):  # the clock of those before tells the next
+        each, first = np.polyfit(number[:n], at[:n], 1)
+        number[: 2 * n] = np.round((at[: 2 * n] - first) / each)
+        n *= 2
+    return number.astype(np.int64)
+
+
+def earlier(log: RunLog, late: Floats, before: Ints) -> RunLog:
+    """The log with its rows by `late` (n,) earlier [s], and inputs that are linear from those of the rows
+    `before` (n,): each picture at its time."""
+    rows = np.flatnonzero(late)
+    if not len(rows):
+        return log
+    back = late[rows] / (log.t[rows] - log.t[before[rows]])
+    made: dict[str, Floats] = {}
+    for name in ("t", "dl", "tension", "pos", "ext", "tip_force", "payload", "base_quaternion"):
+        if (values := getattr(log, name)) is not None:
+            w, made[name] = back.reshape(-1, *[1] * (values.ndim - 1)), values.copy()
+            made[name][rows] = (1.0 - w) * values[rows] + w * values[before[rows]]
+    return replace(log, **made)  # type: ignore[arg-type]
+
+
 def sentences(log: RunLog) -> list[str]:
-    """Return how many rows of its camera repeat, if that are some."""
-    every = int(log.measured.sum())
-    n = every - int(fresh(log).measured.sum())
-    said = (
+    """Return how many rows of its camera repeat, if that are some, and whether it is out of step."""
+    every, seen = int(log.measured.sum()), fresh(log)
+    n, late = every - int(seen.measured.sum()), lateness(seen)[0].max()
+    said = [
         f"{n} of {every} rows repeat the measured tip of the row before, whatever the commands do: the "
         "camera is slower than the log, and they do not count; a row for each picture, at its time, says more"
-    )
-    return [said] * (n > _SOME * every)
+    ] * (n > _SOME * every)
+    if late:
+        said.append(
+            "the camera takes pictures evenly, out of step with the rows: each counts for when it was taken, "
+            f"up to {1e3 * late:.3g} ms before its row"
+        )
+    return said
+
+
+def _new(tip: Floats) -> Flags:
+    """(n,) rows whose `tip` (n, 3) is another than that of the row before."""
+    new = np.ones(len(tip), dtype=np.bool_)
+    new[1:] = (tip[1:] != tip[:-1]).any(axis=1)
+    return new
 
 
 def repeated(tip: Floats, commands: Floats, inputs: Floats) -> Flags:
@@ -69,8 +153,7 @@ def repeated(tip: Floats, commands: Floats, inputs: Floats) -> Flags:
     robot that stands still by friction or backlash is not, and that of one whose tip is rounded is next to
     it.
     """
-    rows, new = np.arange(len(tip)), np.ones(len(tip), dtype=np.bool_)
-    new[1:] = (tip[1:] != tip[:-1]).any(axis=1)
+    rows, new = np.arange(len(tip)), _new(tip)
     seen = np.maximum.accumulate(np.where(new, rows, 0))  # the row that each one shows
     ends = np.flatnonzero(new)[1:]
     before = seen[ends - 1]

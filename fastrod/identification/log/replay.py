@@ -12,7 +12,7 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.identification.log.inputs import base_of, check_driven, inputs
-from fastrod.identification.log.repeats import fresh
+from fastrod.identification.log.repeats import earlier, fresh, lateness
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog, log_of
@@ -118,8 +118,9 @@ def replay(
     dynamics: bool = False,
     progress: Progress | None = None,
 ) -> Replay:
-    """The model's answer to every row of `log`, each row one robot of a batch. Both may be given by their
-    files, and a shipped robot by its name.
+    """The model's answer to every row of `log`, each row one robot of a batch; at a row whose picture had
+    waited for it, to the inputs that were when it was taken. Both may be given by their files, and a shipped
+    robot by its name.
 
     Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins
     at rest. The measured frame is taken as the robot's base frame: nothing is registered and nothing is
@@ -150,7 +151,7 @@ def replay(
             from fastrod.identification.log.questions import questions
 
             open_questions = questions(log, robot)
-        tip, points, converged = _at_rest(moved(log), robot, n_points, simulator, progress)
+        tip, points, converged = _at_rest(log, robot, n_points, simulator, progress)
     tip[~converged], points[~converged] = np.nan, np.nan
     return Replay(
         log=fresh(log),
@@ -167,6 +168,7 @@ def _at_rest(
     log: RunLog, robot: Robot, n_points: int, simulator: Callable[..., Any] | None, progress: Progress | None
 ) -> tuple[Floats, Floats, Flags]:
     """Tip (n, 3) and further points (n, k, 3) of every row [m], and which rows converged, batch by batch."""
+    log = moved(log)
     rows = np.flatnonzero(log.driven)
     tip, points = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan)
     converged = np.zeros(len(log), dtype=np.bool_)
@@ -177,6 +179,8 @@ def _at_rest(
         simulator = Simulator
         if robot.effects:
             rows, solved = _with_effects(log, robot, log.points is not None)
+    if solved is None:
+        log = earlier(log, *lateness(fresh(log)))
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
         tip[chunk], points[chunk], converged[chunk] = (
