@@ -24,7 +24,7 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Ints
 
 LONGEST_STEP = 1e-3
-"""s. Generalized-alpha is second order; `identify` says what half of it would change."""
+"""s. Generalized-alpha is second order: of smooth commands up to 5 Hz it leaves some micrometres."""
 _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
 _FEW = 20  # rows, of which no run is called let go

@@ -114,7 +114,7 @@ def earlier(log: RunLog, late: Floats, before: Ints) -> RunLog:
         return log
     back = late[rows] / (log.t[rows] - log.t[before[rows]])
     made: dict[str, Floats] = {}
-    for name in ("t", "dl", "tension", "pos", "ext", "tip_force", "payload", "base_quaternion"):
+    for name in ("t", "dl", "tension", "pos", "ext", "tip_force", "payload"):  # a base turns slowly
         if (values := getattr(log, name)) is not None:
             w, made[name] = back.reshape(-1, *[1] * (values.ndim - 1)), values.copy()
             made[name][rows] = (1.0 - w) * values[rows] + w * values[before[rows]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,12 @@ from fastrod.types import Flags, Ints
 
 _LEAST_ROWS = 40
 _STRETCHES = 20  # of each run, of which every fourth is held out
+_MISSING: dict[str, Callable[[RunLog], Any]] = {  # of a log that lacks it beside others that do not
+    "session": lambda log: np.full(len(log), log.name),
+    "pos": lambda log: np.full(log.dl.shape, np.nan),
+    "tip_force": lambda log: np.zeros((len(log), 3)),
+    "payload": lambda log: np.zeros(len(log)),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,33 +113,18 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
             "some logs have a measured tip and others have none; give those with the same columns."
         )
     columns: dict[str, Any] = {}
-    if any(log.session is not None for log in logs):
-        columns["session"] = np.concatenate(
-            [np.full(len(log), log.name) if log.session is None else log.session for log in logs]
-        )
-    if any(log.pos is not None for log in logs):
-        columns["pos"] = np.concatenate(
-            [np.full(log.dl.shape, np.nan) if log.pos is None else log.pos for log in logs]
-        )
-    optional = ("tension", "ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
-    for name in optional:
+    for name in (*_MISSING, "tension", "ext", "tip_quaternion", "points", "base_quaternion"):
         pieces = [getattr(log, name) for log in logs]
         have = [span is not None for span in pieces]
-        if all(have):
-            columns[name] = np.concatenate(pieces)
-        elif any(have) and name in ("payload", "tip_force"):
-            width = () if name == "payload" else (3,)
-            columns[name] = np.concatenate(
-                [
-                    np.zeros((len(log), *width)) if p is None else p
-                    for p, log in zip(pieces, logs, strict=True)
-                ]
-            )
-        elif any(have):
+        if any(have) and not all(have) and name not in _MISSING:
             has, lacks = (logs[have.index(flag)].name for flag in (True, False))
             raise LogError(
                 f"log {has!r} has columns for {name}, log {lacks!r} has none; logs that share "
                 "parameters need the same columns."
+            )
+        if any(have):
+            columns[name] = np.concatenate(
+                [_MISSING[name](log) if p is None else p for p, log in zip(pieces, logs, strict=True)]
             )
     labels = [np.array([f"{log.name}:{label}" if label else log.name for label in log.run]) for log in logs]
     return RunLog(

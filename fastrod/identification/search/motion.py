@@ -50,6 +50,8 @@ _FITTED = 4  # candidates of a stage that are fitted
 _PROMISING = 0.3  # of what the best promises: others are not fitted
 _ITERATIONS, _TRIES, _REFINED = 6, 6, 3
 _SHORTER = (0.15, 0.3, 0.5, 0.7)  # of the times at which a fit begins at rest
+_LONGER = 1e-2, 5e-3, 2e-3  # s, steps of a fit where they tell the same motion
+_SAME = 0.1  # of the noise, rms, by which they may differ
 _QUICK = 2.0  # times the step of the fit, with which candidates are tried before the best are refined
 
 
@@ -67,6 +69,10 @@ class MotionRod:
     """Passes of a row beyond which nothing new is tried: in motion only time counts."""
     of_modes: ClassVar[bool] = False
     _known: dict[str, PredictedPose] = field(default_factory=dict)
+
+    def at(self, samples: LogSamples, longest_step: float | None = None) -> MotionRod:
+        """The same at other samples, or in other steps."""
+        return MotionRod(samples, self.points, self.threads, longest_step or self.longest_step)
 
     def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
         """Return what the camera sees of each of these robots, as it is in every session."""
@@ -217,7 +223,7 @@ class MotionSearch(Search):
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
         """Return what the camera sees at the rows of `samples`."""
-        return MotionRod(samples, self.rod.points, self.rod.threads).poses([model.in_sessions(theta)])[0]
+        return self.rod.at(samples).poses([model.in_sessions(theta)])[0]
 
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
         """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
@@ -261,7 +267,7 @@ class MotionSearch(Search):
                 thetas.append(start)
                 thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
             every += [model.in_sessions(theta) for theta in thetas]
-        quick = MotionRod(self.samples, self.rod.points, self.rod.threads, _QUICK * self.rod.longest_step)
+        quick = self.rod.at(self.samples, _QUICK * self.rod.longest_step)
         quick.poses(every)
         near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
         state = replace(state, linearised=cast(LinearisedModel, near))
@@ -331,6 +337,12 @@ def fit_motion(
     target = target_of(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=ANGLE, points=points)
     left, solves = target.tip - pose.position, 0
     noise = _noise(samples, robot, left)
+    for step in sorted({min(step, samples.step) for step in _LONGER if samples.step > LONGEST_STEP})[::-1]:
+        longer = whole.at(samples, step)
+        (other,) = longer.poses([model.in_sessions(model.start)])
+        if other.ok.all() and rms((other.position - pose.position) / noise.sigma) < _SAME:
+            whole = longer
+            break
     theta, fixed, every = model.start, dict[str, Estimate](), model
     for k, horizon in enumerate(HORIZONS):
         report(f"fit in motion, {100 * horizon:.0f} % of each run")
@@ -339,7 +351,7 @@ def fit_motion(
         mine = np.isin(samples.rows, within.rows)
         own = target_of(within, target.sigma, rotation_sigma=ANGLE, points=points)
         own = replace(own, weight=good[mine].astype(float))
-        rod = whole if horizon == 1.0 else MotionRod(within, points, threads)
+        rod = whole if horizon == 1.0 else whole.at(within)
         if k == len(HORIZONS) - 2:  # what the whole log shows
             at = MotionModel(every, theta, within, rod, own.weighed(noise.sigma, noise.sigma))
             fixed = _unseen(at, every, theta)
