@@ -14,7 +14,7 @@ from reportlog import backlash_log
 from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
-from fastrod.identification.log.repeats import earlier, fresh, lateness, repeated, sentences
+from fastrod.identification.log.repeats import earlier, pictures, repeated, sentences
 from fastrod.identification.log.replay import replay
 from fastrod.model.robotfile import load_robot
 
@@ -211,12 +211,15 @@ def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law:
     noisy = tip + np.random.default_rng(0).normal(0.0, 1e-4, tip.shape)
     for every in (2, 4, 7):
         seen = replace(log, tip_position=noisy[rows // every * every])
-        assert_array_equal(fresh(seen).measured, rows % every == 0)
+        assert_array_equal(pictures(seen)[0].measured, rows % every == 0)
         assert sentences(seen)[0].startswith(f"{420 - 420 // every} of 420 rows repeat the measured tip")
 
 
-@pytest.mark.parametrize(("every", "empty"), [(1.09, False), (1.6, True), (3.3, False)])  # rows a picture
-def test_pictures_out_of_step_with_a_log_count_for_when_they_were_taken(every: float, empty: bool) -> None:
+@pytest.mark.study(beyond=2)
+@pytest.mark.parametrize(  # rows a picture, and what stands in rows between
+    ("every", "between"), [(1.09, "the last"), (4.7, "lines"), (1.6, "nothing"), (3.3, "the last")]
+)
+def test_pictures_out_of_step_with_a_log_count_for_when_they_were_taken(every: float, between: str) -> None:
     robot, log, rng = load_robot("prototype"), backlash_log(), np.random.default_rng(3)
     log = replace(log, run=np.full(420, "a"))
     shots = np.arange(-0.7 * every, 420.0, every)
@@ -225,15 +228,23 @@ def test_pictures_out_of_step_with_a_log_count_for_when_they_were_taken(every: f
     new = np.append(True, last[1:] != last[:-1])
     waits = np.where(new, log.t - shots[last], 0.0)
     waits[0] = 0.0
-    tip = replay(earlier(log, waits, np.arange(420) - 1), robot).tip_position
-    seen = (tip + rng.normal(0.0, 1e-5, (420, 3)))[np.flatnonzero(new)][np.cumsum(new) - 1]
-    seen[~new & empty] = np.nan
+    tip = replay(earlier(log, waits), robot).tip_position
+    shown = (tip + rng.normal(0.0, 1e-5, (420, 3)))[np.flatnonzero(new)]
+    seen = shown[np.cumsum(new) - 1]
+    if between == "nothing":
+        seen[~new] = np.nan
+    if between == "lines":
+        seen = np.stack([np.interp(log.t, log.t[new] - waits[new], x) for x in shown.T], axis=1)
     off = seen - replay(log, robot).tip_position
     log = replace(log, tip_position=seen)
-    assert_array_equal(fresh(log).measured, new)
-    assert_allclose(lateness(fresh(log))[0][1:], waits[1:], rtol=0, atol=0.1 / 15.0)
+    found, late = pictures(log)
+    if between == "lines":  # the first begin, and the last end, who knows where
+        new[:5], new[-5:] = found.measured[:5], found.measured[-5:]
+    assert_array_equal(found.measured, new)
+    assert_allclose(late[new][1:], waits[new][1:], rtol=0, atol=0.1 / 15.0)
     assert 8.0 * replay(log, robot).rms < np.sqrt((off[new] ** 2).sum(1).mean())
     assert sentences(log)[-1].startswith("the camera takes pictures evenly, out of step with the rows")
+    assert ("interpolated" in sentences(log)[0]) == (between == "lines")
     made = sample(log)
     assert_array_equal(made.origin[made.given], np.arange(420))
     assert_array_equal(made.origin[made.rows], np.flatnonzero(new))

@@ -35,7 +35,7 @@ from fastrod.effects.executor import (
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
 from fastrod.identification.log.inputs import inputs
-from fastrod.identification.log.repeats import earlier, fresh, lateness, unmeasured
+from fastrod.identification.log.repeats import earlier, pictures, unmeasured
 from fastrod.identification.log.unknowns import Model
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog
@@ -121,13 +121,13 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     """The samples of a log, moved by its drives where these were measured; runs that are interleaved are put
     one after the other. A gap in time is a hold: its inputs stay as they were up to one step before it
     ends."""
-    log = fresh(moved(log))
+    log, late = pictures(moved(log))
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
     ordered, order = _held(log.rows(order), order)
     steps = np.diff(ordered.t)[ordered.run[1:] == ordered.run[:-1]]
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    ordered, order = _pictured(ordered, order)
+    ordered, order = _pictured(ordered, order, late)
     starts = np.flatnonzero(np.concatenate([[True], ordered.run[1:] != ordered.run[:-1]]))
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
@@ -160,9 +160,10 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     )
 
 
-def _pictured(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
-    """The log with each picture that had waited for its row in one of its own, before that row."""
-    late = lateness(log)[0]
+def _pictured(log: RunLog, order: Ints, late: Floats) -> tuple[RunLog, Ints]:
+    """The log with each picture that had waited for its row in one of its own, before that row, and the
+    `order` (n,) likewise; `late` is of the rows of the log that was given."""
+    late = np.where(log.measured, late[order], 0.0)
     rows = np.flatnonzero(late)
     if not len(rows):
         return log, order
@@ -170,8 +171,7 @@ def _pictured(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
     pictures = rows + np.arange(len(rows))
     waits, own = np.zeros(len(both)), np.zeros(len(both), bool)
     waits[pictures], own[pictures + 1] = late[rows], True
-    made = earlier(log.rows(both), waits, np.arange(len(both)) - 1)
-    return unmeasured(made, own), order[both]
+    return unmeasured(earlier(log.rows(both), waits), own), order[both]
 
 
 def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:

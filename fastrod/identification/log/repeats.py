@@ -15,6 +15,8 @@ _CLEAR = 3.0  # steps of the resolution: less is no jump
 _FEW = 10  # jumps, and values of a column
 _SOME = 0.005  # of the rows: less is not worth a sentence
 _CAUGHT_UP = 0.75  # of how far the tip usually goes with the commands
+_FAR = 20.0  # steps of the resolution: far more than rounding
+_LINES = 0.2  # of the rows in which the tip moves: none, of one that nobody interpolated
 _EVEN = 0.2  # of the usual step, by which rows come early or late
 _SURE = 40  # pictures: fewer may come evenly by chance
 _WAITS = 0.01, 0.4  # steps, rms, of pictures that come evenly: 0.29, and some are late themselves
@@ -33,15 +35,36 @@ def resolution(values: Floats) -> Floats:
     return steps
 
 
-def fresh(log: RunLog) -> RunLog:
-    """The log without what its camera repeats: tip, points and orientation are nan there."""
-    old, measured, commands, inputs = np.zeros(len(log), bool), log.measured, log.commands, log.inputs
+def pictures(log: RunLog) -> tuple[RunLog, Floats]:
+    """The log with what its camera saw in the rows alone to which a picture came, nan in others; and (n,) for
+    how long each picture had waited for its row [s].
+
+    A camera that takes pictures evenly, out of step with rows that are even, too, gives each to the next row:
+    the waits are what the rows' times have beyond an even clock. They are 0 where there is no such clock; of
+    all alike nothing is known. Between pictures a tip may repeat, or be interpolated; lines between those
+    say when they were taken.
+    """
+    old, late, tip = np.zeros(len(log), bool), np.zeros(len(log)), log.tip_position
+    kinds = {name: getattr(log, name) for name in ("tip_position", "tip_quaternion", "points")}
+    made = {name: values.copy() for name, values in kinds.items() if values is not None}
+    measured, commands, inputs = log.measured, log.commands, log.inputs
+    used = log.driven & np.isfinite(log.t)
     for label in log.runs:
-        rows = np.flatnonzero(measured & (log.run == label))
-        tip, new = log.tip_position[rows], _new(log.tip_position[rows])
-        even = _waits(log.t[rows], np.flatnonzero(new)).any()  # no robot stands still by the clock
-        old[rows] = ~new if even else repeated(tip, commands[rows], inputs[rows])
-    return unmeasured(log, old) if old.any() else log
+        rows = np.flatnonzero(used & (log.run == label))
+        mine = np.flatnonzero(measured[rows])
+        seen = rows[mine]
+        new = _new(tip[seen])
+        even = _waits(log.t[seen], np.flatnonzero(new)).any()  # no robot stands still by the clock
+        came = new if even else ~repeated(tip[seen], commands[seen], inputs[seen])
+        waits = np.zeros(len(seen))
+        if came.all():
+            came, waits = _between_lines(log.t[seen], tip[seen])
+            for values in made.values():
+                values[seen] = _met(log.t[seen], values[seen], waits)
+        if not waits.any():
+            waits[came] = _waits(log.t[rows], mine[came])
+        old[seen], late[seen] = ~came, waits
+    return (unmeasured(replace(log, **made), old) if old.any() else log), late
 
 
 def unmeasured(log: RunLog, rows: Flags) -> RunLog:
@@ -58,22 +81,13 @@ def unmeasured(log: RunLog, rows: Flags) -> RunLog:
     )
 
 
-def lateness(log: RunLog) -> tuple[Floats, Ints]:
-    """(n,) for how long the picture in each row of a `fresh` log had waited for it [s], and the driven row
-    (n,) before each in its run.
-
-    A camera that takes pictures evenly, out of step with rows that are even, too, gives each to the next row:
-    the waits are what the rows' times have beyond an even clock. They are 0 where there is no such clock; of
-    all alike nothing is known.
-    """
-    late, before, measured = np.zeros(len(log)), np.arange(len(log)), log.measured
-    used = log.driven & np.isfinite(log.t)
-    for label in log.runs:
-        rows = np.flatnonzero(used & (log.run == label))
-        before[rows[1:]] = rows[:-1]
-        seen = np.flatnonzero(measured[rows])
-        late[rows[seen]] = _waits(log.t[rows], seen)
-    return late, before
+def _met(t: Floats, values: Floats, waits: Floats) -> Floats:
+    """(n, ...) values at times `t` (n,), of rows with `waits` (n,) those of the line before, then [s]."""
+    k, made = np.flatnonzero(waits), values.copy()
+    since = (t[k] - waits[k] - t[k - 1]) / (t[k - 1] - t[k - 2])
+    before = values[k - 1]
+    made[k] = before + since.reshape(-1, *[1] * (values.ndim - 1)) * (before - values[k - 2])
+    return made
 
 
 def _waits(t: Floats, seen: Ints) -> Floats:
@@ -106,12 +120,15 @@ def _numbers(at: Floats, least: float) -> Ints:
     return number.astype(np.int64)
 
 
-def earlier(log: RunLog, late: Floats, before: Ints) -> RunLog:
-    """The log with its rows by `late` (n,) earlier [s], and inputs that are linear from those of the rows
-    `before` (n,): each picture at its time."""
-    rows = np.flatnonzero(late)
+def earlier(log: RunLog, late: Floats) -> RunLog:
+    """The log with its rows by `late` (n,) earlier [s], and inputs that are linear from those of the driven
+    rows before: each picture at its time."""
+    rows, before, used = np.flatnonzero(late), np.arange(len(log)), log.driven & np.isfinite(log.t)
     if not len(rows):
         return log
+    for label in log.runs:
+        own = np.flatnonzero(used & (log.run == label))
+        before[own[1:]] = own[:-1]
     back = late[rows] / (log.t[rows] - log.t[before[rows]])
     made: dict[str, Floats] = {}
     for name in ("t", "dl", "tension", "pos", "ext", "tip_force", "payload"):  # a base turns slowly
@@ -121,18 +138,52 @@ def earlier(log: RunLog, late: Floats, before: Ints) -> RunLog:
     return replace(log, **made)  # type: ignore[arg-type]
 
 
+def _between_lines(t: Floats, tip: Floats) -> tuple[Flags, Floats]:
+    """(n,) rows of those at `t` (n,) [s] to which a picture came, where the `tip` (n, 3) [m] between pictures
+    is on straight lines, and how long those had waited that are where two lines meet between two rows (n,)
+    [s]. All, where it is not."""
+    every, step, waits = np.ones(len(t), bool), np.diff(t), np.zeros(len(t))
+    if len(t) < _SURE or not step.min() > 0.0:
+        return every, waits
+    rate = np.diff(tip, axis=0) / step[:, None]
+    bend = np.zeros(len(t))
+    bend[1:-1] = np.linalg.norm(np.diff(rate, axis=0), axis=1) * step[1:]
+    fine = 4.0 * float(np.linalg.norm(resolution(tip))) + _FINEST
+    fast = np.append(np.linalg.norm(rate, axis=1) * step > _FAR * fine, False)
+    on, off = fast & (bend <= fine), fast & (bend > fine)
+    on[[0, -1]] = False
+    if not on.sum() > _LINES * fast.sum() or not off.any() or np.median(bend[off]) < _FAR * fine:
+        return every, waits
+    came = ~every
+    came[1:-1] = on[:-2] & ~on[1:-1] & on[2:]
+    i = np.flatnonzero(on[:-3] & ~on[1:-2] & ~on[2:-1] & on[3:]) + 1
+    turn = rate[i + 1] - rate[i - 1]
+    since = ((rate[i + 1] - rate[i]) * turn).sum(1) / (turn**2).sum(1) * step[i]
+    since = np.clip(since, _WAITS[0] * step[i], step[i])
+    came[i + 1], waits[i + 1] = True, step[i] - since
+    return came, waits
+
+
 def sentences(log: RunLog) -> list[str]:
     """Return how many rows of its camera repeat, if that are some, and whether it is out of step."""
-    every, seen = int(log.measured.sum()), fresh(log)
-    n, late = every - int(seen.measured.sum()), lateness(seen)[0].max()
-    said = [
-        f"{n} of {every} rows repeat the measured tip of the row before, whatever the commands do: the "
-        "camera is slower than the log, and they do not count; a row for each picture, at its time, says more"
-    ] * (n > _SOME * every)
-    if late:
+    every, (seen, late) = int(log.measured.sum()), pictures(log)
+    old = log.measured & ~seen.measured
+    n, said = int(old.sum()), list[str]()
+    if (old & _new(log.tip_position)).sum() > _SOME * every:
+        said.append(
+            f"{n} of {every} rows have a tip that was interpolated, on lines from picture to picture: they "
+            "do not count; the pictures do, found where two lines meet"
+        )
+    elif n > _SOME * every:
+        said.append(
+            f"{n} of {every} rows repeat the measured tip of the row before, whatever the commands do: the "
+            "camera is slower than the log, and they do not count; a row for each picture, at its time, says "
+            "more"
+        )
+    if late.any():
         said.append(
             "the camera takes pictures evenly, out of step with the rows: each counts for when it was taken, "
-            f"up to {1e3 * late:.3g} ms before its row"
+            f"up to {1e3 * late.max():.3g} ms before its row"
         )
     return said
 

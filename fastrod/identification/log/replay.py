@@ -12,7 +12,7 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.identification.log.inputs import base_of, check_driven, inputs
-from fastrod.identification.log.repeats import earlier, fresh, lateness
+from fastrod.identification.log.repeats import earlier, pictures
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog, log_of
@@ -154,7 +154,7 @@ def replay(
         tip, points, converged = _at_rest(log, robot, n_points, simulator, progress)
     tip[~converged], points[~converged] = np.nan, np.nan
     return Replay(
-        log=fresh(log),
+        log=pictures(log)[0],
         robot=robot,
         tip_position=tip,
         converged=converged,
@@ -180,7 +180,7 @@ def _at_rest(
         if robot.effects:
             rows, solved = _with_effects(log, robot, log.points is not None)
     if solved is None:
-        log = earlier(log, *lateness(fresh(log)))
+        log = earlier(log, pictures(log)[1])
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
         tip[chunk], points[chunk], converged[chunk] = (
