@@ -157,8 +157,8 @@ def _between_lines(t: Floats, tip: Floats) -> tuple[Flags, Floats]:
     came = ~every
     came[1:-1] = on[:-2] & ~on[1:-1] & on[2:]
     i = np.flatnonzero(on[:-3] & ~on[1:-2] & ~on[2:-1] & on[3:]) + 1
-    turn = rate[i + 1] - rate[i - 1]
-    since = ((rate[i + 1] - rate[i]) * turn).sum(1) / (turn**2).sum(1) * step[i]
+    change = rate[i + 1] - rate[i - 1]
+    since = ((rate[i + 1] - rate[i]) * change).sum(1) / (change**2).sum(1) * step[i]
     since = np.clip(since, _WAITS[0] * step[i], step[i])
     came[i + 1], waits[i + 1] = True, step[i] - since
     return came, waits
