@@ -63,7 +63,8 @@ def pictures(log: RunLog) -> tuple[RunLog, Floats]:
                 values[seen] = _met(log.t[seen], values[seen], waits)
         if not waits.any():
             waits[came] = _waits(log.t[rows], mine[came])
-        old[seen], late[seen] = ~came, waits
+        step = np.diff(log.t[rows], prepend=log.t[rows[:1]])[mine]
+        old[seen], late[seen] = ~came, np.minimum(waits, 0.98 * step)
     return (unmeasured(replace(log, **made), old) if old.any() else log), late
 
 
@@ -103,8 +104,7 @@ def _waits(t: Floats, seen: Ints) -> Floats:
         off = at - each * number - first
         most = min(_WAITS[1] * usual, _CLOCK * each if number[-1] >= len(at) else np.inf)
         if _WAITS[0] * usual < off.std() < most:
-            waits = np.clip(off + 0.5 * usual, 0.0, 0.98 * np.diff(t, prepend=t[0])[seen])
-            return np.asarray(waits, dtype=np.float64)
+            return np.asarray(np.maximum(off + 0.5 * usual, 0.0), dtype=np.float64)
     return none
 
 
