@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from reportlog import backlash_log
 
 from fastrod.identification.log.autoregression import AutoRegression
+from fastrod.identification.log.camera import earlier, pictures, repeated, sentences
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
-from fastrod.identification.log.repeats import earlier, pictures, repeated, sentences
 from fastrod.identification.log.replay import replay
 from fastrod.model.robotfile import load_robot
 
@@ -243,7 +243,7 @@ def test_pictures_out_of_step_with_a_log_count_for_when_they_were_taken(every: f
     assert_array_equal(found.measured, new)
     assert_allclose(late[new][1:], waits[new][1:], rtol=0, atol=0.1 / 15.0)
     assert 8.0 * replay(log, robot).rms < np.sqrt((off[new] ** 2).sum(1).mean())
-    assert sentences(log)[-1].startswith("the camera takes pictures evenly, out of step with the rows")
+    assert sentences(log)[-1].startswith("the camera's pictures are out of step with the rows")
     assert ("interpolated" in sentences(log)[0]) == (between == "lines")
     made = sample(log)
     assert_array_equal(made.origin[made.given], np.arange(420))

@@ -10,11 +10,11 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.identification.log.advice import excitation
+from fastrod.identification.log.camera import sentences
 from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.order import ColumnOrder, column_order
 from fastrod.identification.log.questions import left_by, read
-from fastrod.identification.log.repeats import sentences
 from fastrod.loading import robot_of
 from fastrod.logs.runlog import RunLog, log_of, on_one_clock
 from fastrod.model.robot import Robot

@@ -34,8 +34,8 @@ from fastrod.effects.executor import (
 )
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
+from fastrod.identification.log.camera import earlier, pictures, unmeasured
 from fastrod.identification.log.inputs import inputs
-from fastrod.identification.log.repeats import earlier, pictures, unmeasured
 from fastrod.identification.log.unknowns import Model
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog

@@ -14,11 +14,11 @@ from itertools import combinations
 
 import numpy as np
 
+from fastrod.identification.log.camera import sentences
 from fastrod.identification.log.clock import clock_offset, clock_sentence
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.order import column_order
 from fastrod.identification.log.registration import CameraRegistration, align, size
-from fastrod.identification.log.repeats import sentences
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot

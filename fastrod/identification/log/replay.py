@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import LogError
+from fastrod.identification.log.camera import earlier, pictures
 from fastrod.identification.log.inputs import base_of, check_driven, inputs
-from fastrod.identification.log.repeats import earlier, pictures
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
 from fastrod.logs.runlog import RunLog, log_of

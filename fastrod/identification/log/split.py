@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import LogError, UnknownNameError, nearest
-from fastrod.identification.log import repeats
+from fastrod.identification.log import camera
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.inputs import check_driven
 from fastrod.identification.log.motion import let_go
@@ -82,7 +82,7 @@ def _cut(log: RunLog, robot: Robot, held_out: Sequence[str], swings: bool) -> Sp
             f"log {log.name!r} leaves {len(rows)} rows to fit once {', '.join(labels)} are held "
             f"out; it needs {_LEAST_ROWS}."
         )
-    said = [*repeats.sentences(log), *([] if log.pos is None else drives.sentences(log))]
+    said = [*camera.sentences(log), *([] if log.pos is None else drives.sentences(log))]
     return SplitLog(samples=samples, rows=rows, tested=tested, labels=labels, notes=said)
 
 

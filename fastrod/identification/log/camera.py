@@ -165,7 +165,7 @@ def _between_lines(t: Floats, tip: Floats) -> tuple[Flags, Floats]:
 
 
 def sentences(log: RunLog) -> list[str]:
-    """Return how many rows of its camera repeat, if that are some, and whether it is out of step."""
+    """Return how many rows no picture came to, if that are some, and whether pictures are out of step."""
     every, (seen, late) = int(log.measured.sum()), pictures(log)
     old = log.measured & ~seen.measured
     n, said = int(old.sum()), list[str]()
@@ -182,8 +182,8 @@ def sentences(log: RunLog) -> list[str]:
         )
     if late.any():
         said.append(
-            "the camera takes pictures evenly, out of step with the rows: each counts for when it was taken, "
-            f"up to {1e3 * late.max():.3g} ms before its row"
+            "the camera's pictures are out of step with the rows: each counts for when it was taken, up to "
+            f"{1e3 * late.max():.3g} ms before its row"
         )
     return said
 
