@@ -208,6 +208,9 @@ def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law:
     steps = log.dl[rows // 7 * 7]  # which are held, and a tip that is late
     late = np.concatenate([tip[:1], tip[rows[:-1] // 7 * 7]])
     assert not repeated(late.round(4), steps, steps).any()
+    held = rows * 3 // 10  # commands that are held for 3 or 4 rows
+    still = replace(log, run=np.full(420, "a"), dl=log.dl[held], tip_position=tip[held])
+    assert not pictures(still)[1].any()
     noisy = tip + np.random.default_rng(0).normal(0.0, 1e-4, tip.shape)
     for every in (2, 4, 7):
         seen = replace(log, tip_position=noisy[rows // every * every])
@@ -226,8 +229,7 @@ def test_pictures_out_of_step_with_a_log_count_for_when_they_were_taken(every: f
     shots = shots[rng.random(len(shots)) > 0.02 * (every > 1.5)] / 15.0  # some are lost
     last = np.searchsorted(shots, log.t, side="right") - 1  # the picture that each row shows
     new = np.append(True, last[1:] != last[:-1])
-    waits = np.where(new, log.t - shots[last], 0.0)
-    waits[0] = 0.0
+    waits = np.where(new & (log.t > 0.0), log.t - shots[last], 0.0)
     tip = replay(earlier(log, waits), robot).tip_position
     shown = (tip + rng.normal(0.0, 1e-5, (420, 3)))[np.flatnonzero(new)]
     seen = shown[np.cumsum(new) - 1]

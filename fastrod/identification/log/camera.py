@@ -45,8 +45,8 @@ def pictures(log: RunLog) -> tuple[RunLog, Floats]:
     say when they were taken.
     """
     old, late, tip = np.zeros(len(log), bool), np.zeros(len(log)), log.tip_position
-    kinds = {name: getattr(log, name) for name in ("tip_position", "tip_quaternion", "points")}
-    made = {name: values.copy() for name, values in kinds.items() if values is not None}
+    kinds = ("tip_position", "tip_quaternion", "points")
+    made = {name: values.copy() for name in kinds if (values := getattr(log, name)) is not None}
     measured, commands, inputs = log.measured, log.commands, log.inputs
     used = log.driven & np.isfinite(log.t)
     for label in log.runs:
@@ -54,7 +54,9 @@ def pictures(log: RunLog) -> tuple[RunLog, Floats]:
         mine = np.flatnonzero(measured[rows])
         seen = rows[mine]
         new = _new(tip[seen])
-        even = _waits(log.t[seen], np.flatnonzero(new)).any()  # no robot stands still by the clock
+        going = np.diff(commands[seen], axis=0, prepend=commands[seen[:1]]).any(axis=1)
+        # no robot stands still by the clock, unless its commands do
+        even = (going & ~new).sum() >= _FEW and _waits(log.t[seen], np.flatnonzero(new)).any()
         came = new if even else ~repeated(tip[seen], commands[seen], inputs[seen])
         waits = np.zeros(len(seen))
         if came.all():
