@@ -4,11 +4,15 @@ A room that grows by more than 2 % changes the table, in a commit of its own tha
 """
 
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 WINGS = ("gym_envs", "viewer", "device", "scenes", "tests", "perf")
+PAGES = {"README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"}
 # a docstring begins its line; other strings are code, in all their lines
 TEXT = re.compile(
     r'(?P<doc>^[ \t]*[rR]?"""(?:\\.|[^\\])*?""")|"""(?:\\.|[^\\])*?"""'
@@ -33,6 +37,14 @@ def rooms() -> dict[str, int]:
 def test_no_room_outgrows_its_budget() -> None:
     table = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["fastrod"]["budget"]
     assert {name: n for name, n in rooms().items() if n > 1.02 * table.get(name, 0)} == {}
+
+
+def test_nothing_else_is_at_the_top() -> None:
+    git = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if git.returncode:
+        pytest.skip("no git repository")
+    top = {line.partition("/")[0] for line in git.stdout.splitlines()}
+    assert {name for name in top if not name.startswith(".")} == {*WINGS, *PAGES, "fastrod", "pyproject.toml"}
 
 
 if __name__ == "__main__":

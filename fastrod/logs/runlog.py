@@ -310,19 +310,22 @@ def log_of(given: RunLog | str | Path, robot: Robot) -> RunLog:
 def on_one_clock(log: RunLog, clock: float) -> RunLog:
     """The log with its commands laid on the clock of what was measured: those of time t stand in the row of
     t + `clock` [s]. Rows for which no command is known miss it."""
-    if not clock:
-        return log
+    return with_commands_at(log, log.t + clock) if clock else log
+
+
+def with_commands_at(log: RunLog, t: Floats) -> RunLog:
+    """The log with the commands of the times `t` (n,) [s] in its rows, linear between rows of a run; nan
+    where none is known. Rows at their own time keep theirs."""
     names = [name for name in ("dl", "tension", "pos", "ext") if getattr(log, name) is not None]
     made = {name: getattr(log, name).copy() for name in names}
     for label in log.runs:
         own = (log.run == label) & np.isfinite(log.t)
+        apart = own & (t != log.t)
         for values in made.values():
             for column in values.T:
                 rows = own & np.isfinite(column)
                 if rows.any():
-                    column[own] = np.interp(
-                        log.t[own] + clock, log.t[rows], column[rows], left=np.nan, right=np.nan
-                    )
+                    column[apart] = np.interp(t[apart], log.t[rows], column[rows], left=np.nan, right=np.nan)
     return replace(log, **made)
 
 

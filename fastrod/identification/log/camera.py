@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fastrod.logs.runlog import RunLog
+from fastrod.logs.runlog import RunLog, with_commands_at
 from fastrod.types import Flags, Floats, Ints
 
 _FINEST = 1e-9  # m; less between two values is rounding
@@ -67,6 +67,8 @@ def pictures(log: RunLog) -> tuple[RunLog, Floats]:
             waits[came] = _waits(log.t[rows], mine[came])
         step = np.diff(log.t[rows], prepend=log.t[rows[:1]])[mine]
         old[seen], late[seen] = ~came, np.minimum(waits, 0.98 * step)
+    if (q := made.get("tip_quaternion")) is not None:
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
     return (unmeasured(replace(log, **made), old) if old.any() else log), late
 
 
@@ -85,7 +87,8 @@ def unmeasured(log: RunLog, rows: Flags) -> RunLog:
 
 
 def _met(t: Floats, values: Floats, waits: Floats) -> Floats:
-    """(n, ...) values at times `t` (n,), of rows with `waits` (n,) those of the line before, then [s]."""
+    """(n, ...) values of the rows at `t` (n,) [s]; where a picture had waited (`waits` (n,) [s]) those at the
+    end of the line that leads through the two rows before."""
     k, made = np.flatnonzero(waits), values.copy()
     since = (t[k] - waits[k] - t[k - 1]) / (t[k - 1] - t[k - 2])
     before = values[k - 1]
@@ -123,21 +126,10 @@ def _numbers(at: Floats, least: float) -> Ints:
 
 
 def earlier(log: RunLog, late: Floats) -> RunLog:
-    """The log with its rows by `late` (n,) earlier [s], and inputs that are linear from those of the driven
-    rows before: each picture at its time."""
-    rows, before, used = np.flatnonzero(late), np.arange(len(log)), log.driven & np.isfinite(log.t)
-    if not len(rows):
-        return log
-    for label in log.runs:
-        own = np.flatnonzero(used & (log.run == label))
-        before[own[1:]] = own[:-1]
-    back = late[rows] / (log.t[rows] - log.t[before[rows]])
-    made: dict[str, Floats] = {}
-    for name in ("t", "dl", "tension", "pos", "ext", "tip_force", "payload"):  # a base turns slowly
-        if (values := getattr(log, name)) is not None:
-            w, made[name] = back.reshape(-1, *[1] * (values.ndim - 1)), values.copy()
-            made[name][rows] = (1.0 - w) * values[rows] + w * values[before[rows]]
-    return replace(log, **made)  # type: ignore[arg-type]
+    """The log with its rows by `late` (n,) earlier [s], each picture at its time and under the commands of
+    that time."""
+    t = log.t - late
+    return replace(with_commands_at(log, t), t=t) if late.any() else log
 
 
 def _between_lines(t: Floats, tip: Floats) -> tuple[Flags, Floats]:

@@ -337,6 +337,7 @@ def fit_motion(
     target = target_of(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=ANGLE, points=points)
     left, solves = target.tip - pose.position, 0
     noise = _noise(samples, robot, left)
+    # steps as long as the robot of the file allows
     for step in sorted({min(step, samples.step) for step in _LONGER if samples.step > LONGEST_STEP})[::-1]:
         longer = whole.at(samples, step)
         (other,) = longer.poses([model.in_sessions(model.start)])
