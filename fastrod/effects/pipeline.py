@@ -71,6 +71,7 @@ class EffectPipeline:
         self.rest_length = robots[0].rest_tendon_length
         self.gravity = np.array([robot.gravity for robot in robots])
         self._felt = self.gravity  # at the last step
+        self._base = self._base_rotation = np.empty(0)
         self._pulled = np.array(
             [robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool
         )
@@ -288,6 +289,8 @@ class EffectPipeline:
         return executor.sense(self.links, self._open(ports, params, n_steps), measurement, dt)
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
+        if self._base is not ports.base_pose:  # which no one changes in place
+            self._base, self._base_rotation = ports.base_pose, matrix_from_quaternion(ports.base_pose[:, 3:])
         opened = open_ports(
             ports,
             params,
@@ -295,8 +298,8 @@ class EffectPipeline:
             n=self.n_robots,
             rest_length=self.rest_length,
             gravity=self._felt,
-            base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]),
-            time=np.nan_to_num(self.time),
+            base_rotation=self._base_rotation,
+            time=np.where(np.isnan(self.time), 0.0, self.time),
             n_steps=n_steps,
         )
         opened.solved_bend = self._bend.copy()

@@ -216,7 +216,9 @@ class EffectPorts:
 
 
 def _rows(a: Floats, n: int) -> Floats:
-    return np.array(np.broadcast_to(a, (n, *a.shape[1:])), order="C")
+    out = np.empty((n, *a.shape[1:]))
+    out[:] = a
+    return out
 
 
 def open_ports(

@@ -79,10 +79,10 @@ class Routing:
 def _times(a: Floats, matrix: Floats) -> Floats:
     """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be
     its robots bit by bit. The rows are the last axis meanwhile, for there are many of them."""
-    out = np.zeros((matrix.shape[1], *a.shape[:-1]))
-    for column, row in zip(np.moveaxis(a, -1, 0), matrix, strict=True):
+    out = np.zeros((matrix.shape[1], *a.shape[-2::-1]))
+    for column, row in zip(a.T, matrix, strict=True):
         out += row.reshape(-1, *[1] * column.ndim) * column
-    return np.ascontiguousarray(np.moveaxis(out, 0, -1))
+    return np.ascontiguousarray(out.T)
 
 
 def route(robot: Robot) -> Routing:

@@ -75,7 +75,8 @@ class ModalRods:
         self.dynamics, self.n_robots = options.dynamics, n_robots
         modes = options.modes or usual_modes(robots, coarse=self.dynamics)
         self.modal = ModalSolver(robots, layout, params, n_robots, threads, modes)
-        self.stepper = TimeStepper(self.modal, Step(SCHEMES[options.scheme], dt, float(options.rho)))
+        time = Step(SCHEMES[options.scheme], dt, float(options.rho))
+        self.stepper = TimeStepper(self.modal, time, options.jumps)
         self.tape: Tape | None = None
         self._events: list[Event] = []  # of the call that is recorded
         self._acting: Acting | None = None

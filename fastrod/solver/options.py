@@ -69,15 +69,20 @@ class Modal:
     """Scheme of a step in time: "generalized_alpha" (second order), "bdf2" or "bdf1"."""
     rho: Annotated[float, Bound(least=0.0, most=0.9, hint="Beyond it sudden loads grow.")] = 0.5
     """Spectral radius of generalized-alpha at infinite frequency: from 0, strongest damping, to 0.9."""
+    jumps: bool = True
+    """Whether an input that changes suddenly has jumped at the start of the step. Without, every input goes
+    evenly through the step, as between two samples of a log."""
     modes: Modes | None = None
     """Resolution of the rod; None: `usual_modes`, at rest `Modes(6, 4)` and in motion `Modes(4, 2)`, of
     robots that are heavy for their stiffness more, except in a contact scene."""
 
     def __post_init__(self) -> None:
         check(self, "")
-        if not self.dynamics and (self.scheme, self.rho) != (Modal.scheme, Modal.rho):
-            what = f"scheme is {self.scheme!r}" if self.scheme != Modal.scheme else f"rho is {self.rho!r}"
-            raise InputError(f"{what} without dynamics, and nothing moves in time; give dynamics=True.")
+        for name in () if self.dynamics else ("scheme", "rho", "jumps"):
+            if (given := getattr(self, name)) != getattr(Modal, name):
+                raise InputError(
+                    f"{name} is {given!r} without dynamics, and nothing moves in time; give dynamics=True."
+                )
         if self.modes is not None:
             _check_modes(self.modes)
 

@@ -20,6 +20,7 @@ from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 _JUMP = 2.0
 """A change of an input of more than so many times the one before is a jump: the acceleration after it is then
 measured first. A smooth beginning counts as one too, which costs a step and no accuracy."""
+_ROUNDING = 1e-12  # of an input's largest value: a change so small is none
 _MOVING = (
     "tendon_length",
     "tension",
@@ -50,10 +51,10 @@ Note = Callable[[Ints, Ports, Step, bool, ModalMotion], None]
 
 class TimeStepper:
     """Robots of modes in time. `time` is the step of dt; `change` (n_robots,) by how much each input changed
-    at the last one."""
+    at the last one, where they may have jumped (`sudden`)."""
 
-    def __init__(self, modal: ModalSolver, time: Step) -> None:
-        self.modal, self.time = modal, time
+    def __init__(self, modal: ModalSolver, time: Step, sudden: bool = True) -> None:
+        self.modal, self.time, self.sudden = modal, time, sudden
         self.change: dict[str, Floats] = {}
         self.note: Note | None = None
         """Is called with what was solved; steps then go on until Newton's method ends."""
@@ -174,17 +175,20 @@ class TimeStepper:
         n = self.modal.n_robots
         jump, change = self.begun.astype(float), {}
         self.begun[:] = False
-        for name in _MOVING:
+        for name in _MOVING if self.sudden else ():
             now, then = getattr(ports, name), getattr(before, name)
-            if now is then or (name == "base_pose" and len(self.modal.host.inertia)):
+            if now is then or not (len(now) or len(then)):
+                continue
+            if name == "base_pose" and len(self.modal.host.inertia):
                 continue  # a body that gives way moves as the rod has it
             if then.shape == now.shape and (then == now).all():
                 continue
             if then.shape[1:] != now.shape[1:] or not len(now) or not len(then):
-                if len(now) or len(then):
-                    jump[:] = 1.0
+                jump[:] = 1.0
                 continue
             step = np.abs(now - then).reshape(max(len(now), len(then)), -1).max(1, initial=0.0)
+            # inputs that rest, but for rounding
+            step[step < _ROUNDING * np.abs(now).max()] = 0.0
             change[name] = np.broadcast_to(step, n)
             last = self.change.get(name, np.zeros(n))
             jump[(change[name] > _JUMP * last) & (change[name] > 0.0)] = 1.0

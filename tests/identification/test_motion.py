@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fastrod import Robot, Segment, Simulator, Tendon, save_robot
+from fastrod import Modal, Robot, Segment, Simulator, Tendon, save_robot
 from fastrod.commands.cli import main
 from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
@@ -19,6 +20,7 @@ from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay, let_go
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report.result import Result
+from fastrod.identification.search.motion import SideBySide
 from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Lump
 
@@ -218,7 +220,8 @@ def test_replay_in_motion_is_the_simulator() -> None:
     assert shown.dynamics
     assert shown.converged.all()
     for run, seed in (("a", 3), ("b", 4)):
-        sim, dl, tips = Simulator(plant, dt=1e-3, dynamics=True, points_per_segment=4), commands(seed, t), []
+        solver, dl, tips = Modal(dynamics=True, jumps=False), commands(seed, t), []
+        sim = Simulator(plant, dt=1e-3, solver=solver, points_per_segment=4)
         between = np.stack([np.interp(np.arange(79) * 1e-3, t, row) for row in dl.T], axis=1)
         for k, now in enumerate(plant.rest_tendon_length + between):
             sim.step(now) if k else sim.settle(now)
@@ -252,6 +255,35 @@ def test_a_payload_is_a_mass_at_the_tip() -> None:
 
 
 @pytest.mark.study
+def test_jobs_side_by_side_share_their_questions() -> None:
+    """Each has as many as it likes, and jobs of its own; an error is that of its job alone."""
+    rounds: list[set[str]] = []
+    desk = SideBySide(lambda questions: rounds.append(set(questions)))
+
+    def job(name: str, count: int) -> Callable[[], str]:
+        def asks() -> str:
+            for k in range(count):
+                desk.ask({f"{name}{k}": ()})
+            return name
+
+        return asks
+
+    def parent() -> list[str]:
+        return [*desk.each([job("b", 2), job("c", 3)]), job("d", 1)()]
+
+    assert desk.each([job("a", 3), parent, job("none", 0)]) == ["a", ["b", "c", "d"], "none"]
+    assert rounds == [{"a0", "b0", "c0"}, {"a1", "b1", "c1"}, {"a2", "c2"}, {"d0"}]
+    assert desk.each([]) == []
+
+    def fails() -> str:
+        raise LogError("no")
+
+    with pytest.raises(LogError, match="no"):
+        desk.each([fails, job("e", 2)])
+    assert rounds[4:] == [{"e0"}, {"e1"}]
+    assert job("f", 1)() == "f"
+
+
 def test_what_rest_shows_is_fitted_at_rest() -> None:
     """Stretch and a lump's mass, from tips at rest: neither needs a time step."""
     plant, commanded = robot(**TRUE), 1.5 * commands(1, np.arange(80) * 0.025)

@@ -56,6 +56,7 @@ class MotionReplay:
         without mass, `LogError` for a payload that changes within a run.
         """
         from fastrod.simulator import Simulator
+        from fastrod.solver.options import Modal
 
         runs = self._compared()
         clock, masses = _clock(self.samples, runs, self.longest_step), self._payloads(runs)
@@ -71,7 +72,7 @@ class MotionReplay:
             points_per_segment=4,
             outputs="full" if self.points or self.samples.log.without_tip or rods[0].effects else "tip",
             threads=self.threads or 1,
-            dynamics=True,
+            solver=Modal(dynamics=True, jumps=False),
         )
         given = _prepared(self.samples, rods[0])
         alive, seen = np.ones(len(rods), bool), list[Floats]()

@@ -7,12 +7,13 @@ known of what they stand beside.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import ClassVar, cast
+from functools import cached_property, partial
+from typing import ClassVar, TypeVar, cast
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from fastrod.identification.search.solve import Estimate, Fit, minimise, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
 
+_T = TypeVar("_T")
 _STEP = 0.02
 """Step as a fraction of an unknown's typical size, for differences: a thousandth of the value for most.
 Below it the tolerance of a step's Newton method would show, 1e-6 of the bend."""
@@ -55,6 +57,78 @@ _SAME = 0.1  # of the noise, rms, by which they may differ
 _QUICK = 2.0  # times the step of the fit, with which candidates are tried before the best are refined
 
 
+class SideBySide:
+    """Jobs that ask one thing for answers, one job at a time: each goes on until it has a question; when all
+    have one, `answer` gets the questions of all, and they go on. A batch of rods takes little longer than one
+    rod, and fits that do not depend on each other are moved in one batch so."""
+
+    def __init__(self, answer: Callable[[dict[str, tuple[Robot, ...]]], None]) -> None:
+        self._answer = answer
+        self._questions: dict[str, tuple[Robot, ...]] = {}
+        self._talk = threading.Condition()  # who holds it works; all others wait
+        self._working, self._asking, self._round = 1, 0, 0
+        self._failed: BaseException | None = None
+
+    def each(self, jobs: Sequence[Callable[[], _T]]) -> list[_T]:
+        """Return what each of the jobs does; a job may have jobs of its own. Raises what the first of them
+        raised."""
+        found, raised, left = dict[int, _T](), dict[int, BaseException](), len(jobs)
+
+        def work(k: int) -> None:
+            nonlocal left
+            with self._talk:
+                try:
+                    found[k] = jobs[k]()
+                except BaseException as error:
+                    raised[k] = error
+                left -= 1
+                if left:
+                    self._working -= 1
+                    self._go_on()
+                else:  # who waits for them works in place of the last one
+                    self._talk.notify_all()
+
+        with self._talk:
+            self._working += left - bool(left)
+            for k in range(len(jobs)):
+                threading.Thread(target=work, args=(k,), daemon=True).start()
+            try:
+                self._talk.wait_for(lambda: not left)
+            except BaseException:  # who runs this has stopped it
+                self._answer = _stop
+                raise
+        if raised:
+            raise raised[min(raised)]
+        return [found[k] for k in range(len(jobs))]
+
+    def ask(self, questions: dict[str, tuple[Robot, ...]]) -> None:
+        """Return when they are answered. Raises what the answer raised."""
+        with self._talk:
+            self._questions |= questions
+            self._working, self._asking, mine = self._working - 1, self._asking + 1, self._round
+            self._go_on()
+            self._talk.wait_for(lambda: self._round > mine)
+            if self._failed is not None:
+                raise self._failed
+
+    def _go_on(self) -> None:
+        """Answer, where nobody has more to ask."""
+        if self._working or not self._asking:
+            return
+        try:
+            self._failed = None
+            self._answer(self._questions)
+        except BaseException as error:
+            self._failed = error
+        self._working, self._asking, self._questions = self._asking, 0, {}
+        self._round += 1
+        self._talk.notify_all()
+
+
+def _stop(_: object) -> None:
+    raise KeyboardInterrupt
+
+
 @dataclass(eq=False)
 class MotionRod:
     """Rods in motion at the rows of `samples`, each robot once."""
@@ -70,20 +144,26 @@ class MotionRod:
     of_modes: ClassVar[bool] = False
     _known: dict[str, PredictedPose] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.side_by_side = SideBySide(self._move)
+
     def at(self, samples: LogSamples, longest_step: float | None = None) -> MotionRod:
         """The same at other samples, or in other steps."""
         return MotionRod(samples, self.points, self.threads, longest_step or self.longest_step)
 
     def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
         """Return what the camera sees of each of these robots, as it is in every session."""
-        new = {repr(each): each for each in robots if repr(each) not in self._known}
-        for keys, batch in _batches(new):
-            replay = MotionReplay(
-                self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
-            )
+        if new := {key: each for each in robots if (key := repr(each)) not in self._known}:
+            self.side_by_side.ask(new)
+        return [self._known[repr(each)] for each in robots]
+
+    def _move(self, robots: dict[str, tuple[Robot, ...]]) -> None:
+        replay = MotionReplay(
+            self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
+        )
+        for keys, batch in _batches(robots):
             self._known |= zip(keys, replay.poses(batch), strict=True)
             self.runs += 1
-        return [self._known[repr(each)] for each in robots]
 
 
 def _batches(robots: dict[str, tuple[Robot, ...]]) -> Iterator[tuple[list[str], list[tuple[Robot, ...]]]]:
@@ -198,19 +278,25 @@ class MotionModel:
 
     def fit(self, model: Model, start: Floats, iterations: int, known: Floats | None = None) -> Fit:
         """The best parameters from `start` (p,) on, within limits and under priors; slopes by the first
-        unknowns may be `known`. A step and the slopes there are one batch."""
+        unknowns may be `known`. Tries and the slopes there are one batch."""
+        first = known.shape[-1] if known is not None and _moves_geometry(model) else 0
 
-        def residual(theta: Floats) -> Floats:
-            first = known.shape[-1] if known is not None and _moves_geometry(model) else 0
-            moved = (theta + np.diag(_steps(model, theta)))[first:]
-            with suppress(RobotError):  # a trial that is no robot is a worse one
-                self.rod.poses([model.in_sessions(each) for each in (theta, *moved)])
-            return self.residual(model, theta)
+        def move(thetas: Sequence[Floats]) -> None:
+            robots = list[tuple[Robot, ...]]()
+            for theta in thetas:
+                with suppress(RobotError):  # a trial that is no robot is a worse one
+                    moved = (theta + np.diag(_steps(model, theta)))[first:]
+                    robots += [model.in_sessions(each) for each in (theta, *moved)]
+            self.rod.poses(robots)
 
         def slopes(theta: Floats, r: Floats) -> Floats:
             return self.slopes(model, theta, r, known)
 
-        return minimise(residual, slopes, start, *model.prior, model.limits, iterations, _TRIES)
+        def residual(theta: Floats) -> Floats:
+            return self.residual(model, theta)
+
+        move([start])
+        return minimise(residual, slopes, start, *model.prior, model.limits, iterations, _TRIES, move)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,12 +370,12 @@ class MotionSearch(Search):
             for name in first
             if promise[name] > max(_PROMISING * promise[first[0]], price[name] * state.fit.loss)
         ]
-        return [
-            super(MotionSearch, self).candidate(state, name)
-            if name in worth
-            else unfitted(name, "it promises too little", len(models[name].unknowns) - n)
-            for name in names
-        ]
+        tried = self._each(state, [partial(self.candidate, state, name) for name in worth])
+        fitted, few = dict(zip(worth, tried, strict=True)), "it promises too little"
+        return [fitted.get(name) or unfitted(name, few, len(models[name].unknowns) - n) for name in names]
+
+    def _each(self, state: ModelState, jobs: Sequence[Callable[[], _T]]) -> list[_T]:
+        return cast(MotionModel, state.linearised).rod.side_by_side.each(jobs)
 
     def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
         with np.errstate(invalid="ignore"):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
@@ -67,6 +68,7 @@ N_BLOCKS = 20
 MOST_PASSES = 4000.0
 """Iterations of each row, on the average, after which nothing new is tried. A log with two effects took
 390."""
+_T = TypeVar("_T")
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _STIFF = 0.01  # of a segment's own stiffness, over that of a tendon
@@ -339,12 +341,16 @@ class Search:
             return None
         # an effect hardly changes how the model answers to what it had before
         known, patterns = state.fit.slopes[..., :n], state.alternatives
-        fits = [
-            self._fit(linearised, model, theta, amplitudes, patterns, _FEW, known)
-            for _, theta in promising[:3]
-        ]
+        near = partial(self._fit, linearised, model)
+        fits = self._each(
+            state, [partial(near, at, amplitudes, patterns, _FEW, known) for _, at in promising[:3]]
+        )
         best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
-        return self._fit(linearised, model, best, amplitudes, patterns, _MANY, known)
+        return near(best, amplitudes, patterns, _MANY, known)
+
+    def _each(self, state: ModelState, jobs: Sequence[Callable[[], _T]]) -> list[_T]:  # noqa: ARG002
+        """Return what each of the jobs beside a state does, which do not depend on each other."""
+        return [job() for job in jobs]
 
     def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
         """Loss that the response to the new parameters could take away at best, beside what the others can
@@ -607,7 +613,9 @@ class Search:
         near = [c for c in fitted if c.fraction > least and c.fraction > most / _NEAR][:_REFINED]
         # of these even the fit so far is linear
         heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
-        exact = {c.name: self._exact(state, c, thorough=thorough) for c in dict.fromkeys([*near, *heavy])}
+        some = list(dict.fromkeys([*near, *heavy]))
+        solved = self._each(state, [partial(self._exact, state, c, thorough=thorough) for c in some])
+        exact = {c.name: found for c, found in zip(some, solved, strict=True)}
         best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:

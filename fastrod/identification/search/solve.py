@@ -3,7 +3,7 @@ evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ Slopes = Callable[[Floats, Floats], Floats]
 BEYOND = 3.0
 """Standard deviations of its prior: a parameter beyond is evidence of what the model lacks."""
 _SMALL_STEP = 1e-3  # of a standard error: below it a fit has arrived
+_LEAST = 1e-4  # of the loss: a step that gains less is the last
+_TOGETHER = 3  # tries
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,9 +86,12 @@ def minimise(
     limits: tuple[Floats, Floats],
     iterations: int,
     tries: int = 6,
+    ahead: Callable[[Sequence[Floats]], None] | None = None,
 ) -> Fit:
     """Levenberg-Marquardt inside `limits`, with normal priors; a step is shortened so many `tries` times at
-    most. One that leads to nan counts as worse."""
+    most. One that leads to nan counts as worse. `ahead` is called with the places that are tried next, where
+    they are had together in the time of one; a step that promised less than the last one must gain is then
+    not shortened."""
     low, high = limits
     precision = 1.0 / sd**2
     theta = np.clip(start, low, high)
@@ -107,23 +112,31 @@ def minimise(
         held = ((theta <= low) & (gradient < 0.0)) | ((theta >= high) & (gradient > 0.0))
         free = ~held
         moved = False
-        for _ in range(tries):
+        dampings = [damping, *(max(damping, 1e-3) * 10.0**k for k in range(1, tries))]
+        trials = list[Floats]()
+        for more in dampings:
             step = np.zeros_like(theta)
-            step[free] = _solve(H[np.ix_(free, free)] + damping * np.diag(np.diag(H)[free]), gradient[free])
-            tried = np.clip(theta + step, low, high)
+            step[free] = _solve(H[np.ix_(free, free)] + more * np.diag(np.diag(H)[free]), gradient[free])
+            trials.append(np.clip(theta + step, low, high))
+        for k, tried in enumerate(trials):
+            damping = dampings[k]
+            if ahead is not None and k % _TOGETHER == 0:
+                ahead(trials[k : k + _TOGETHER])
             r_tried = residual(tried)
             now = cost(tried, r_tried)
             if now < best:
                 moved = True
                 break
-            damping = max(damping, 1e-3) * 10.0
+            step = tried - theta
+            if ahead is not None and 0.0 <= step @ (2.0 * gradient - H @ step) < _LEAST * best:
+                break
         if not moved:
             break
         gain = best - now
         step = tried - theta
         theta, r, best, damping = tried, r_tried, now, max(0.1 * damping, 1e-9)
         J = slopes(theta, r)
-        if gain < 1e-4 * best or np.abs(step * np.sqrt(np.diag(H))).max() < _SMALL_STEP:
+        if gain < _LEAST * best or np.abs(step * np.sqrt(np.diag(H))).max() < _SMALL_STEP:
             break
     edge = 1e-6 * (np.where(np.isfinite(high - low), high - low, 1.0))
     at = tuple(bool(b) for b in (theta <= low + edge) | (theta >= high - edge))
