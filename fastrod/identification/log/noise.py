@@ -21,6 +21,8 @@ _OUTLIER = 5.0  # sigma
 _LONG_SETTLE = 3.0  # s, where what is seen at rest is slow: creep and ringing are no noise
 _LONG_ENOUGH = 90  # samples that must be left then
 _TO_SIGMA = 1.4826  # of a median absolute deviation
+_FAST_NEAR, _OF_NEAR = 2.5, 0.9546  # sigma, within which so much of a normal distribution's sigma is left
+_OF_FAST = 0.71  # relative standard error of their floor, times the root of their number; by simulation
 _KNOWN = 0.05  # a noise that rests tell to this is looked for nowhere else
 _OVERFITTED = 0.05  # of white noise, which a model may leave less by
 _WITHIN = 2.0  # standard errors of the noise at rest
@@ -110,11 +112,9 @@ def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
 def _read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     pieces = at_rest(samples)
     if sum(len(p) for p in pieces) < ENOUGH:
-        return Noise(
-            _fast(np.diff(residual, n=3, axis=0)),
-            0.0,
-            "third differences of the residual; the robot never rests, so slow noise cannot be seen",
-        )
+        how = "third differences of the residual; the robot never rests, so slow noise cannot be seen"
+        third = np.diff(residual, n=3, axis=0)
+        return Noise(_fast(third), 0.0, how, uncertainty=_OF_FAST / np.sqrt(max(len(third), 1)))
     n = sum(len(p) for p in pieces)
     period = samples.step or 1.0
     found = _read(samples, tip, pieces, period)
@@ -219,12 +219,14 @@ def _white(tip: Floats, pieces: Sequence[Ints]) -> tuple[Floats, float]:
 
 
 def _fast(third: Floats) -> Floats:
-    """(3,) sigma of white noise with these third differences (n, 3), robustly."""
-    return np.asarray(
-        np.maximum(_TO_SIGMA * np.median(np.abs(third), axis=0) / np.sqrt(20.0), 1e-7)
-        if len(third)
-        else np.full(3, 1e-4)
-    )
+    """(3,) sigma of white noise with these third differences (n, 3), robustly: of those that are near."""
+    if not len(third):
+        return np.full(3, 1e-4)
+    size = _TO_SIGMA * np.median(np.abs(third), axis=0)
+    for _ in range(2):
+        near = np.abs(third) <= _FAST_NEAR * size
+        size = np.sqrt((near * third**2).sum(0) / np.maximum(near.sum(0), 1)) / _OF_NEAR
+    return np.asarray(np.maximum(size / np.sqrt(20.0), 1e-7))
 
 
 def keep(samples: LogSamples, residual: Floats, noise: Noise) -> Flags:
