@@ -70,11 +70,15 @@ class Trial(NamedTuple):
 class Rig:
     """An emulated prototype in motion."""
 
-    def __init__(self, folder: Path, seed: int, *, stepped: bool, eds: Path | None) -> None:
+    def __init__(
+        self, folder: Path, seed: int, *, stepped: bool = True, eds: Path | None = None, **limits: float
+    ) -> None:
         self.clock = SteppedClock() if stepped else WallClock()
-        self.jump, self.storm = 0.0, 0
-        hardware, bus = load_hardware(), f"virtual:faults-{time.monotonic_ns()}"
-        hardware = replace(hardware, limits=replace(hardware.limits, following_error=FOLLOWING))
+        self.jump, self.storm, self.radius = 0.0, 0, RADIUS
+        hardware = load_hardware()
+        self.bus = bus = f"virtual:faults-{time.monotonic_ns()}"
+        limits = {"following_error": FOLLOWING} | limits
+        hardware = replace(hardware, limits=replace(hardware.limits, **limits))
         both: Any = {"clock": self.clock, "eds": eds}
         self.emulator = Emulator(hardware, bus, seal=seal(seed, "none"), seed=seed, taut=True, **both)
         self.drives = self.emulator.drives
@@ -104,12 +108,12 @@ class Rig:
     def command(self) -> None:
         """Send the circle's point of now."""
         with suppress(RefusedError):
-            self.prototype.command(circle(self.clock.now() - self._began))
+            self.prototype.command(circle(self.clock.now() - self._began, self.radius))
 
     def sync(self) -> None:
         self._other.send(0x080, b"")
 
-    def wait(self, seconds: float, until: Callable[[], bool]) -> None:
+    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """So much time passes, stopped or not, with commands, or less if `until` comes true."""
         end, due = self.clock.now() + seconds, -math.inf
         while self.clock.now() < end and not until():
@@ -138,11 +142,18 @@ class Rig:
         self.storm = syncs
         self._repeat(1e-3 / syncs * max(STORMS), self.sync)
 
+    def repair(self) -> None:
+        self.drives.restore()
+        self.emulator.frozen = self.emulator.hidden = False
+        self.storm = 0
+
     def close(self) -> None:
         self._over.set()
         for thread in self._threads:
             thread.join(2.0)
-        self.drives.restore()
+        self.repair()
+        if self.recorder.recording:
+            self.recorder.stop()
         self.prototype.close()
         self._other.close()
         self.emulator.close()
@@ -169,17 +180,20 @@ def record(prototype: Prototype, log: Path) -> Any:
     return recorder
 
 
-def circle(t: float) -> Floats:
+def circle(t: float, radius: float = RADIUS) -> Floats:
     """(4,) tendon lengths [m] at `t` [s]."""
     angle = 2.0 * math.pi * t / PERIOD
-    bend = RADIUS * min(1.0, t / 0.5) * np.array([math.cos(angle), math.sin(angle)])
+    bend = radius * min(1.0, t / 0.5) * np.array([math.cos(angle), math.sin(angle)])
     return np.concatenate([bend, -bend])
 
 
 _CODES, _COUNTS, _JUMPS = (0x2310, 0x3210, 0x4310), (2000, -2000, 4000, -4000), (3600.0, -0.5, 0.3)
 INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
     "heartbeat lost": (lambda rig, k: rig.drives.lose_heartbeat(k % 4), "sent its last heartbeat"),
-    "emergency message": (lambda rig, k: rig.drives.emergency(k % 4, _CODES[k % 3]), "sent an emergency: 0x"),
+    "emergency message": (
+        lambda rig, k: rig.drives.emergency(k % 4, _CODES[k % 3], lasting=True),
+        "sent an emergency: 0x",
+    ),
     "following error": (lambda rig, _: rig.block(), "ollowing error"),
     "bus off": (lambda rig, _: rig.drives.bus_off(), "the bus carries nothing"),
     "node reboot": (lambda rig, k: rig.drives.reboot(k % 4), "NMT state is 0 (booting)"),
