@@ -187,6 +187,16 @@ def test_the_identified_robot_predicts_what_the_report_says(effect: str, tmp_pat
     assert rms == pytest.approx(result.test.after, rel=0.01)
 
 
+@pytest.mark.study
+def test_commands_that_are_held_until_the_next_row_are_said_to_look_like_a_delay() -> None:
+    log = sealed("none")[0]
+    tip = np.concatenate([log.tip_position[:1], log.tip_position[:-1]])
+    result = identify(replace(log, tip_position=tip), robot(), threads=1)
+    assert value(result, "latency", "delay")[0] == pytest.approx(1.0 / 15.0, rel=0.03)
+    assert "is within a row of this log: commands held until the next row look so, too." in result.summary
+    assert "within a row" not in found("latency").summary
+
+
 # On a log of 28 s
 
 

@@ -240,6 +240,7 @@ def assemble(
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
     said += _sign_of(base.without) if base.without else []
     said += _stand_ins(kept, final)
+    said += _within_a_row(kept, final, samples.step)
     said += _sentences(limits(robot, samples)) if say_limits else []
     fast, band = faster_than_commands(samples, np.asarray(samples.log.tip_position) - after)
     if say_limits and fast > _FAST:
@@ -299,6 +300,17 @@ def _stand_ins(names: Sequence[str], state: ModelState) -> list[str]:
             size = f"{plain_name(u.name)} comes out at {amount(value, u.unit)}"
             usual = f"{abs(value) / u.scale:.0f} times what is usual"
             said.append(f"{size}, {usual}: {words(name)} stands in for something else.")
+    return said
+
+
+def _within_a_row(names: Sequence[str], state: ModelState, step: float) -> list[str]:
+    """Delays no longer than the log's `step` [s], in sentences: so exactly it does not say when its commands
+    came."""
+    said, values = [], state.model.values(state.theta)
+    for name in sorted({"latency", "second_order_lag"} & set(names)):
+        if (delay := float(values[name][0])) < 1.05 * step:
+            size = f"{words(name).capitalize()} of {1e3 * delay:.2g} ms"
+            said.append(f"{size} is within a row of this log: commands held until the next row look so, too.")
     return said
 
 
