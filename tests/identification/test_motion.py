@@ -20,7 +20,7 @@ from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay, let_go
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report.result import Result
-from fastrod.identification.search.motion import SideBySide
+from fastrod.identification.search.motion import MotionRod, SideBySide
 from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Lump
 
@@ -282,6 +282,31 @@ def test_jobs_side_by_side_share_their_questions() -> None:
         desk.each([fails, job("e", 2)])
     assert rounds[4:] == [{"e0"}, {"e1"}]
     assert job("f", 1)() == "f"
+
+
+def test_robots_that_forces_drive_are_moved_together_whatever_their_stiffness() -> None:
+    """Their stiffness is part of what an effect of their tendons does."""
+    pulled = robot(effects=({"name": "latency", "delay": 0.01},))
+    (segment,) = pulled.segments
+    robots = [
+        (replace(pulled, segments=(replace(segment, mode="tendon_tension", bending_stiffness=(k, k)),)),)
+        for k in (0.0022, 0.0025)
+    ]
+    t, pull = 0.01 * np.arange(6), np.array([1.0, 0.0, -1.0, 0.0])
+    tension = 2.0 + 0.3 * np.sin(20.0 * t)[:, None] * pull
+    log = RunLog(
+        name="forces",
+        t=t,
+        run=np.full(6, "a"),
+        dl=np.zeros((6, 4)),
+        tension=tension,
+        tip_position=np.zeros((6, 3)),
+    )
+    together = MotionRod(sample(log)).poses(robots)
+    for each, pose in zip(robots, together, strict=True):
+        (alone,) = MotionReplay(sample(log)).poses([each])
+        assert_allclose(pose.position, alone.position, atol=1e-15)
+    assert np.abs(together[0].position - together[1].position).max() > 1e-6
 
 
 def test_what_rest_shows_is_fitted_at_rest() -> None:

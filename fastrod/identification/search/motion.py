@@ -188,11 +188,16 @@ def _follows(name: str) -> bool:
 
 
 def _geometry(robot: Robot) -> tuple[object, ...]:
-    return tuple((s.length, tuple((t.offset, t.angle) for t in s.tendons)) for s in robot.segments)
+    """How tendons bend the robot; forces do by its stiffness, too."""
+    return tuple(
+        (s.length, robot.by_tension and s.bending_stiffness, *((t.offset, t.angle) for t in s.tendons))
+        for s in robot.segments
+    )
 
 
 def _moves_geometry(model: Model) -> bool:
-    return any(u.place[0] == "robot" and u.place[1] in _GEOMETRY for u in model.unknowns)
+    names = {*_GEOMETRY, "bending_stiffness"} if model.robot.by_tension else _GEOMETRY
+    return any(u.place[0] == "robot" and u.place[1] in names for u in model.unknowns)
 
 
 def _with_effects(robot: Robot, names: Sequence[str]) -> Robot:
