@@ -19,8 +19,9 @@ from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 
 _JUMP = 2.0
 """A change of an input of more than so many times the one before is a jump: the acceleration after it is then
-measured first. A smooth beginning counts as one too, which costs a step and no accuracy."""
-_ROUNDING = 1e-12  # of an input's largest value: a change so small is none
+measured first. A corner counts as one too, which costs a step and some of the second order
+(`Modal.jumps`)."""
+_ROUNDING = 1e-12  # of a robot's input: it rests where it changes by so little
 _MOVING = (
     "tendon_length",
     "tension",
@@ -187,8 +188,7 @@ class TimeStepper:
                 jump[:] = 1.0
                 continue
             step = np.abs(now - then).reshape(max(len(now), len(then)), -1).max(1, initial=0.0)
-            # inputs that rest, but for rounding
-            step[step < _ROUNDING * np.abs(now).max()] = 0.0
+            step[step < _ROUNDING * np.abs(now).reshape(len(now), -1).max(1)] = 0.0
             change[name] = np.broadcast_to(step, n)
             last = self.change.get(name, np.zeros(n))
             jump[(change[name] > _JUMP * last) & (change[name] > 0.0)] = 1.0

@@ -208,7 +208,7 @@ def _held(sim: Any, rest: Any, off: Floats, given: Mapping[str, Any]) -> Any:
         soft = sim.compliance()[:, :3]
         force = force + np.einsum("nij,nj->ni", np.linalg.pinv(soft, rcond=_STIFF), aim - state.tip_position)
         state = sim.settle(**{**given, "tip_force": own + force})
-    sim.set_in_motion(np.zeros(6))  # it is let go at once, not evenly through a step
+    sim.set_in_motion(np.zeros(6), off.any(1))  # let go at once, not evenly through a step
     return state
 
 

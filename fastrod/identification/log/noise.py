@@ -114,7 +114,7 @@ def _read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     if sum(len(p) for p in pieces) < ENOUGH:
         how = "third differences of the residual; the robot never rests, so slow noise cannot be seen"
         third = np.diff(residual, n=3, axis=0)
-        return Noise(_fast(third), 0.0, how, uncertainty=_OF_FAST / np.sqrt(max(len(third), 1)))
+        return Noise(_fast(third), 0.0, how, uncertainty=_OF_FAST / max(len(third), 1) ** 0.5)
     n = sum(len(p) for p in pieces)
     period = samples.step or 1.0
     found = _read(samples, tip, pieces, period)
