@@ -188,7 +188,7 @@ def _follows(name: str) -> bool:
 
 
 def _geometry(robot: Robot) -> tuple[object, ...]:
-    """How tendons bend the robot; forces do by its stiffness, too."""
+    """Return how tendons bend the robot; forces do by its stiffness, too."""
     return tuple(
         (s.length, robot.by_tension and s.bending_stiffness, *((t.offset, t.angle) for t in s.tendons))
         for s in robot.segments

@@ -22,7 +22,7 @@ BEYOND = 3.0
 """Standard deviations of its prior: a parameter beyond is evidence of what the model lacks."""
 _SMALL_STEP = 1e-3  # of a standard error: below it a fit has arrived
 _LEAST = 1e-4  # of the loss: a step that gains less is the last
-_TOGETHER = 3  # tries
+_TOGETHER = 3  # tries after the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +120,8 @@ def minimise(
             trials.append(np.clip(theta + step, low, high))
         for k, tried in enumerate(trials):
             damping = dampings[k]
-            if ahead is not None and k % _TOGETHER == 0:
-                ahead(trials[k : k + _TOGETHER])
+            if ahead is not None and (k == 0 or k % _TOGETHER == 1):
+                ahead(trials[k : k + _TOGETHER] if k else trials[:1])
             r_tried = residual(tried)
             now = cost(tried, r_tried)
             if now < best:
