@@ -201,7 +201,7 @@ INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
     "marker lost": (lambda rig, _: setattr(rig.emulator, "hidden", True), "the marker was last seen"),
     "clock jump": (lambda rig, k: setattr(rig, "jump", _JUMPS[k % 3]), "the wall clock jumped"),
     "encoder jump": (lambda rig, k: rig.drives.encoder_jump(k % 4, _COUNTS[k % 4]), "moved its tendon by"),
-    "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
+    "foreign SYNC": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
 """Injection of each fault into the k-th trial, and what its sentence must say."""
 
