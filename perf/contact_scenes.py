@@ -315,12 +315,10 @@ def measure(options: Any) -> list[Section]:
     """The table by kind, and the sentences."""
     seed, count = options.seed, TOGETHER if options.quick else options.count
     play(make_batch(seed, options.first), dt=_dt(options, 0))  # compiled, and not timed
-    every, said, silent, end = (
-        list[Played](),
-        Counter[str](),
-        list[str](),
-        time.monotonic() + 60.0 * options.minutes,
-    )
+    every = list[Played]()
+    said = Counter[str]()
+    silent = list[str]()
+    end = time.monotonic() + 60.0 * options.minutes
     taken, slowest, where = list[float](), 0.0, ""
     for index in range(options.first, options.first - (-count // TOGETHER)):
         if time.monotonic() > end:

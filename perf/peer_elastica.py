@@ -35,11 +35,9 @@ def _clamped(system: Any, n: int, of: Any, radius: float, density: float) -> Any
     """
     ea: Any = importlib.import_module("elastica")
     h, second = of.LENGTH / (n - 0.5), 0.25 * math.pi * radius**4
-    start, along, normal = (
-        np.array([0.0, 0.0, -0.5 * h]),
-        np.array([0.0, 0.0, 1.0]),
-        np.array([1.0, 0.0, 0.0]),
-    )
+    start = np.array([0.0, 0.0, -0.5 * h])
+    along = np.array([0.0, 0.0, 1.0])
+    normal = np.array([1.0, 0.0, 0.0])
     moduli = {"youngs_modulus": of.BENDING / second, "shear_modulus": of.TORSION / (2.0 * second)}
     rod = ea.CosseratRod.straight_rod(n, start, along, normal, n * h, radius, density, **moduli)
     system.append(rod)

@@ -123,10 +123,8 @@ def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) 
             return f"the drive at node {nodes[message.drive]} sent an emergency: {in_words(message.code)}"
     oldest = max(_OLD / hardware.rate, hardware.limits.feedback_age)
     transmission, limits = Transmission(hardware.drives), hardware.limits
-    tension, behind = (
-        transmission.tension(feedback.torque),
-        np.abs(transmission.wound(feedback.following_error)),
-    )
+    tension = transmission.tension(feedback.torque)
+    behind = np.abs(transmission.wound(feedback.following_error))
     late = limits.following_error * min(1.0, _BEHIND + speed / limits.rate)
     most = min(hardware.limits.tension, max(_PULL * hardware.pretension, _LEAST_PULL))
     for k, node in enumerate(nodes):

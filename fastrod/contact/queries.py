@@ -128,10 +128,8 @@ def swept_clearance(
 
     wanted = np.isfinite(after.position).all((1, 2)) & (np.ones(n, bool) if rows is None else rows)
     each = np.arange(n)
-    times, gaps = (
-        np.tile([0.0, 1.0], (n, 1)),
-        np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1),
-    )
+    times = np.tile([0.0, 1.0], (n, 1))
+    gaps = np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1)
     for _ in range(_MOST_SPLITS):
         bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - np.nan_to_num(moved)[:, None] * np.diff(times, axis=1))
         worst = bound.argmin(1)

@@ -22,13 +22,11 @@ _EVEN = 1e-8  # of a mesh's size: a neighbour that rises less above a face does 
 def pack(obstacles: Sequence[Obstacle], by_fcl: bool = False) -> Surfaces:
     """The arrays that the kernels read; obstacle k of the list is row k. With `by_fcl` FCL measures the
     distances of meshes."""
-    boxes, links, corners, normals, roots = (
-        [np.zeros((0, 12))],
-        [np.zeros((0, 2), np.int64)],
-        [np.zeros((0, 9))],
-        [np.zeros((0, 7, 3))],
-        [],
-    )
+    boxes = [np.zeros((0, 12))]
+    links = [np.zeros((0, 2), np.int64)]
+    corners = [np.zeros((0, 9))]
+    normals = [np.zeros((0, 7, 3))]
+    roots = []
     n_nodes = n_faces = 0
     for obstacle in obstacles:
         if obstacle.shape != "mesh":

@@ -120,10 +120,8 @@ def settle_plan(plan: Plan, folder: Path) -> None:
     """
     for left in folder.glob(f"{PLAN}.*.part"):  # of a killed run; the folder is locked
         left.unlink(missing_ok=True)
-    before, any_there = (
-        read_plan(folder),
-        any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet"))),
-    )
+    before = read_plan(folder)
+    any_there = any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet")))
     if before is None:
         # of an empty one, the shards themselves say whose they are
         if any_there and not (folder / PLAN).exists():

@@ -219,10 +219,8 @@ class Shapes:
     def _rows(self, robot: Robot, drawn: Drawn, settled: Settled) -> list[Column]:
         """One row of each lane; base frame, as in a run log."""
         shape, ok = settled
-        rotation, origin = (
-            matrix_from_quaternion(np.array(robot.base_quaternion)),
-            np.array(robot.base_position),
-        )
+        rotation = matrix_from_quaternion(np.array(robot.base_quaternion))
+        origin = np.array(robot.base_position)
         lost = ~ok[:, None]
 
         def seen(a: Floats, kind: type = np.float32) -> np.ndarray:

@@ -325,10 +325,8 @@ class Rod:
         if which.all():
             self._state = self._capsules = None
         self._fresh = self._fresh | which
-        self._wrench, self._failed = (
-            np.where(which[:, None], 0.0, self._wrench),
-            np.where(which, 0, self._failed),
-        )
+        self._wrench = np.where(which[:, None], 0.0, self._wrench)
+        self._failed = np.where(which, 0, self._failed)
 
     def snapshot(self) -> RodSnapshot:
         """A copy of everything that a later step depends on."""

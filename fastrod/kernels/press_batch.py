@@ -57,11 +57,9 @@ def violations(
         first, last, deepest = rows.start[k], rows.start[k + 1], 0.0
         for r in range(first, last):
             i = rows.robot[r]
-            used, contact, spacing = (
-                search.contacts.used[i],
-                search.contacts.contact[i],
-                search.rods.spacing[i],
-            )
+            used = search.contacts.used[i]
+            contact = search.contacts.contact[i]
+            spacing = search.rods.spacing[i]
             deep, _ = violation(max(n_found[r], 0), found[r], used, contact, spacing, surfaces)
             deepest = max(deepest, deep)
         if last - first > 1 or search.rods.own:
@@ -84,6 +82,7 @@ def press_some(
     spin: Floats,
     first: int,
     yielding: float,
+    soft: Floats,
     renew: Floats,
     still: Flags,
     step: Floats,
@@ -113,7 +112,7 @@ def press_some(
         np.empty((3, n)),
     )
     stack, wall = np.empty(2 * STACK), np.empty(MOST_PLANES, WALL)
-    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding)
+    every = Touching(rods, surfaces, motion, contacts, hessian, gradient, change, spin, first, yielding, soft)
     for k in range(len(start) - 1):
         count, unknowns = gather_world(start[k], start[k + 1], robot, every, pressing, stack, wall)
         i, own = robot[start[k]], n_q * (start[k + 1] - start[k])

@@ -154,14 +154,12 @@ def exp_map(o: Vec) -> tuple[Mat, float, float, float]:
     k = 1.0 / (1.0 + 0.25 * g * g * t)
     a = k * g
     c = 0.5 * a * g
-    xx, xy, xz, yy, yz, zz = (
-        c * o[0] * o[0],
-        c * o[0] * o[1],
-        c * o[0] * o[2],
-        c * o[1] * o[1],
-        c * o[1] * o[2],
-        c * o[2] * o[2],
-    )
+    xx = c * o[0] * o[0]
+    xy = c * o[0] * o[1]
+    xz = c * o[0] * o[2]
+    yy = c * o[1] * o[1]
+    yz = c * o[1] * o[2]
+    zz = c * o[2] * o[2]
     x, y, z = a * o[0], a * o[1], a * o[2]
     rotation = (1.0 - yy - zz, xy - z, xz + y, xy + z, 1.0 - xx - zz, yz - x, xz - y, yz + x, 1.0 - xx - yy)
     return rotation, a, k * dg, c

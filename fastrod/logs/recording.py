@@ -416,12 +416,10 @@ def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -
         )
         return np.stack([column[name] for name in wanted], axis=1) if wanted else np.zeros((len(rows), 0))
 
-    quaternion, force, payload, ext = (
-        group(_TIP_QUATERNION),
-        group(_TIP_FORCE),
-        column["payload"],
-        group(r"ext_\d+"),
-    )
+    quaternion = group(_TIP_QUATERNION)
+    force = group(_TIP_FORCE)
+    payload = column["payload"]
+    ext = group(r"ext_\d+")
     base = group(r"base_q[wxyz]")
     extra = {
         name: values

@@ -55,10 +55,8 @@ class Linear:
         (m, n), n_rows = delta.shape, len(self.rows)
 
         def respond(copies: slice, columns: bool) -> tuple[Response, RodShape]:
-            twin, k = (
-                self._copies({name: a[copies] for name, a in moved.items()}, relocate),
-                len(moved["extension"][copies]),
-            )
+            twin = self._copies({name: a[copies] for name, a in moved.items()}, relocate)
+            k = len(moved["extension"][copies])
             response, shape = twin.respond(columns)
             return Response(*(_split(a, k) for a in response)), RodShape(*(_split(a, k) for a in shape))
 
@@ -169,10 +167,8 @@ class Linear:
         jacobian = np.empty((n, 6, n_tendons + m - len(pulled)))
         jacobian[:, :, layout.row_tendon] = by_residual[:, :, :n_held]
         closed = (by_input - np.matmul(by_residual, error[..., None])[..., 0]).transpose(1, 2, 0)
-        jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = (
-            closed[:, :, : len(pulled)],
-            closed[:, :, len(pulled) :],
-        )
+        jacobian[:, :, pulled] = closed[:, :, : len(pulled)]
+        jacobian[:, :, n_tendons:] = closed[:, :, len(pulled) :]
         return jacobian
 
     def _close(self, response: Response) -> Floats:

@@ -20,6 +20,7 @@ from fastrod.contact.frames import blended, longest_move
 from fastrod.errors import InputError, Problem, ProblemSentence
 from fastrod.kernels.contact.candidates import MOST_FOUND
 from fastrod.kernels.contact.press import RENEWED
+from fastrod.kernels.contact.pressed_world import SOFT
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.kernels.contact_batch import search_gaps, search_worlds
@@ -54,11 +55,13 @@ _KNOT = 3.0  # rad, from node to node: a rod that bends by more is none
 _SAME_GAP = 1e-10  # m
 _INSIDE = 1e-5  # m: as deep as a rod may be in what it touches
 _DIVISIONS = 4  # of a step into four
+_AT_MOUNTING = 1.001  # of the length of the mounting: what is nearer to the base presses on that
 _ROOM = 4  # contacts: room is made for a multiple
 AT_REST, _CREEPS = 1e-7, 2e-9  # m: of motion within one step of a rest, and below the tolerance asked for
 _MOST_STEPS, _GROWS, _FALLS = 100, 16.0, 1.0 / 16.0  # to a rest, and by how much they grow, or fall
 _FIRST, _RESTS, _LONGEST, _GIVEN_UP = 1e-3, 10.0, 1e4, 1e-9  # s: their lengths
 _LATE, _SAME_PLACE = 1e-5, 1e-7  # rad, m: by so little a rod may change after its contacts were placed
+_SOFT = 1e-7  # of the flexibility L^3 / EI of a rod: R of its rigid contacts, where that is less than `SOFT`
 _SLOW = 0.03  # s: a rod with a mass for its steps to rest alone rings at 3.5 / 2 pi over it
 
 
@@ -95,7 +98,11 @@ class TouchingRods(ModalRods):
         self._weigh()
 
     def _weigh(self) -> None:
-        """Give robots that only rest a mass for the steps to it, such that they would ring at some Hz."""
+        """Note how soft contacts of these robots are; those that only rest get a mass for the steps to it,
+        such that they would ring at some Hz."""
+        stiffest = [max(max(s.bending_stiffness) for s in robot.segments) for robot in self.robots]
+        flexible = np.array([robot.length**3 for robot in self.robots]) / stiffest
+        self._soft = np.minimum(np.full(self.n_robots, SOFT), _SOFT * flexible)
         if self.dynamics:
             return
         pieces = self.modal.pieces
@@ -173,6 +180,8 @@ class TouchingRods(ModalRods):
             if folds[i] > FOLDS:
                 what = f"its curvature times a tendon's offset is {folds[i]:.2g}; at 1 it folds: bend it less"
             said, kind = f"{said}; {what}.", Problem.CONTACT_STUCK
+            if 0 <= k < len(names) and s <= _AT_MOUNTING * self.engine.rods.first[i]:
+                said = f"contact{where}, where the rod is mounted and cannot yield: keep it clear of there."
             if self._through[i]:
                 said = f"contact{where}: the rod would go through it; take smaller steps, or go around it."
                 kind = Problem.CONTACT_TUNNELLED
@@ -425,7 +434,8 @@ class TouchingRods(ModalRods):
             # a body gives way within one step of its engine, however long those to a rest are
             yielding = (how.dt / self.stepper.time.dt) ** 2 if moves else 1.0
             slopes = d.hessian, d.gradient, d.point_change, d.point_rotation
-            model = (*slopes, acting.points[0].shape[1], yielding)
+            # as do contacts: a blow's force goes by the inverse of the length, and its depth would, too
+            model = (*slopes, acting.points[0].shape[1], yielding, yielding * self._soft)
             renew = np.full(n, RENEWED if count < _RENEWING else np.inf)
             renew[size < (0.0 if moves else _NEAR)] = _EXACTLY
             self._press(left, (*seen, *model, renew, still, step, changed))
@@ -461,10 +471,8 @@ class TouchingRods(ModalRods):
             modal.hold(arrived, ports, *found, ends, q, True)
             end_some(arrived, contacts, engine.slips_from is None)
         failed = rows[~ok[rows]]
-        self._through[failed], self._full[failed] = (
-            gone[failed],
-            contacts.used[failed] == contacts.contact.shape[1],
-        )
+        self._through[failed] = gone[failed]
+        self._full[failed] = contacts.used[failed] == contacts.contact.shape[1]
         self._go_back(failed, then)
         modal.place_points(acting.points, ports.extension)
         return ok

@@ -83,10 +83,8 @@ class EnvPage:
         eye, target = np.array(backdrop.eye), np.array(backdrop.target)
         away = eye - target
         back = 1.0 + 1.2 * float(np.ptp(self._places, axis=0).max()) / max(float(np.linalg.norm(away)), 1e-9)
-        self._server.initial_camera.position, self._server.initial_camera.look_at = (
-            target + back * away,
-            target,
-        )
+        self._server.initial_camera.position = target + back * away
+        self._server.initial_camera.look_at = target
 
     def _draw(self, at: str, backdrop: Backdrop) -> list[str]:
         """Everything of one environment; the names it has in the page."""

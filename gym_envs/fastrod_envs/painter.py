@@ -158,10 +158,8 @@ def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> PaintedMesh
 @lru_cache(maxsize=4)
 def ball_mesh(sides: int = 16) -> PaintedMesh:
     """A ball of radius 1."""
-    polar, around = (
-        np.linspace(0.0, np.pi, sides // 2 + 1),
-        np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False),
-    )
+    polar = np.linspace(0.0, np.pi, sides // 2 + 1)
+    around = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     z = np.broadcast_to(-np.cos(polar)[:, None], (len(polar), sides))
     points = np.stack(
         [np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around), z], axis=2

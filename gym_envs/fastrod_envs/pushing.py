@@ -326,11 +326,9 @@ class PushTask(HostedTask):
         unit = "m/s" if options.action == "rate" else "m"
         names = "extension, displacements toward d1 and d2 of every segment alike"
         actions = (Field("displacement", unit, tuple(low), tuple(high), f"{what} {names}".strip()),)
-        base, far, place = (
-            np.array(course.robot.base_position),
-            1.5 * course.robot.length,
-            np.array(course.place),
-        )
+        base = np.array(course.robot.base_position)
+        far = 1.5 * course.robot.length
+        place = np.array(course.place)
         goal = Field("goal", "m", course.least, course.largest, "where the cube is to be, x and y, world")
         states = (
             goal,

@@ -51,10 +51,8 @@ def _distances(k, frame, points, bound, surfaces, out):
 def _rays(k, frame, points, directions, longest, surfaces, out):
     stack = np.empty(2 * STACK)
     for i in range(len(points)):
-        p, along = (
-            (points[i, 0], points[i, 1], points[i, 2]),
-            (directions[i, 0], directions[i, 1], directions[i, 2]),
-        )
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        along = (directions[i, 0], directions[i, 1], directions[i, 2])
         t, n = ray_hit(k, frame, p, along, longest, surfaces, stack)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = t, n[0], n[1], n[2]
 
@@ -362,10 +360,8 @@ def test_the_walls_of_a_concave_corner():
 
 
 def test_a_wall_is_seen_from_above_the_diagonal_of_its_two_triangles():
-    wide, slim = (
-        trimesh.creation.box(extents=(0.25, 0.25, 0.25)),
-        trimesh.creation.box(extents=(0.0625, 0.125, 0.125)),
-    )
+    wide = trimesh.creation.box(extents=(0.25, 0.25, 0.25))
+    slim = trimesh.creation.box(extents=(0.0625, 0.125, 0.125))
     slim.invert()
     beside, above = Seen(mesh(trimesh.util.concatenate([wide, slim]))).walls(
         [[1e-6, 0.0, 0.0605], [0.0, 0.0, 0.0605]], 0.01

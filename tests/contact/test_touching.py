@@ -319,6 +319,33 @@ def test_a_body_and_its_rod_lose_no_momentum_when_the_rod_hits_a_wall(ratio: flo
     assert 0.5 * mass * twist[:3] @ twist[:3] < 0.5 * mass * 0.5**2
 
 
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize(("larger", "stiffer"), [(10.0, 1e4), (10.0, 1e6), (0.1, 1e-4), (1.0, 1e5)])
+def test_similar_rods_do_the_same_however_large_and_stiff(
+    moving: bool, larger: float, stiffer: float
+) -> None:
+    """A ball that comes at 2 m/s: all lengths go by one number, all forces by another."""
+
+    def struck(size: float, stiff: float) -> Any:
+        bends = {"bending_stiffness": (stiff * EI,) * 2, "torsional_stiffness": stiff * EI}
+        larger = {"length": size * LENGTH, "body_radius": size * RADIUS}
+        robot = rod(**bends, **larger, line_density=DENSITY * stiff / size**4)
+        scene = ContactScene(obstacles=[sphere(0.02 * size, name="ball")], rod_radius=size * RADIUS)
+        sim = Simulator(robot, dt=2e-3, solver=Modal(dynamics=moving, modes=Modes(4, 2)), contact=scene)
+        rows = []
+        for k in range(8):
+            x = size * (0.0285 - 0.004 * min(k, 3))
+            state = sim.step(obstacle_pose={"ball": (x, 0.0, 0.06 * size, 1.0, 0.0, 0.0, 0.0)})
+            assert state.ok.all()
+            rows.append((state.position[0] / size, state.contacts.total_force[0] * size**2 / stiff))
+        return tuple(map(np.array, zip(*rows, strict=True)))
+
+    (here, force), (there, other) = struck(1.0, 1.0), struck(larger, stiffer)
+    assert np.abs(force).max() > 1.0
+    assert_allclose(there, here, atol=1e-4 * LENGTH)
+    assert_allclose(other, force, rtol=1e-2, atol=1e-2)
+
+
 def test_what_goes_with_no_contact_is_refused() -> None:
     sim = simulator(rod(), BALL)
     sim.settle()
@@ -338,9 +365,17 @@ def test_what_stops_a_rod_is_said() -> None:
         before = aside.step(tip_force=(0.01, 0.0, 0.0))
     state = aside.step(obstacle_pose={"block": (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)})
     assert not state.ok[0]
-    assert "contact with 'block' at arclength" in state.problems[0]
-    assert "come there in smaller steps." in state.problems[0]
+    assert state.problems[0] == (
+        "contact with 'block' at arclength 0.006 m, where the rod is mounted and cannot yield: keep it clear "
+        "of there."
+    )
     assert_array_equal(state.tip_position, before.tip_position)
     state = aside.step(obstacle_pose={"block": (0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)}, tip_force=(0.01, 0, 0))
     assert state.ok.all()
     assert state.velocity[0, -1, 0] == pytest.approx(before.velocity[0, -1, 0], rel=0.2)  # it goes on
+    jaws = [box((0.02, 0.3, 0.03), name=n, position=(x, 0.0, 0.1)) for n, x in (("l", -0.02), ("r", 0.02))]
+    squeezed = simulator(rod(), *jaws)
+    squeezed.settle()
+    state = squeezed.step(obstacle_pose={"l": (-0.012, 0, 0.1, 1, 0, 0, 0), "r": (0.012, 0, 0.1, 1, 0, 0, 0)})
+    assert "' at arclength 0.0" in state.problems[0]
+    assert "come there in smaller steps." in state.problems[0]

@@ -20,11 +20,9 @@ PATH = np.cumsum(rng.uniform(-0.4, 0.4, (2, N_STEPS, 3)), axis=1) + 0.3
 # irregular, and some steps that take no time
 DT = rng.uniform(0.001, 0.05, N_STEPS) * (rng.random(N_STEPS) > 0.1)
 ANGLE = rng.uniform(0.0, 1.0, PATH.shape)
-FRACTION, WIDTH, SPREAD = (
-    rng.uniform(0.0, 1.0, (2, 3)),
-    rng.uniform(0.05, 0.6, (2, 3)),
-    rng.uniform(0.0, 0.9, (2, 3)),
-)
+FRACTION = rng.uniform(0.0, 1.0, (2, 3))
+WIDTH = rng.uniform(0.05, 0.6, (2, 3))
+SPREAD = rng.uniform(0.0, 0.9, (2, 3))
 WIDTH[0, 0] = FRACTION[1, 1] = 0.0
 SLOW = WIDTH + 0.02
 LAG = np.array([0.11, 1e3])

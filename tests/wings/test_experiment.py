@@ -28,10 +28,8 @@ from fastrod_device.prototype import Prototype
 
 ROBOT = load_robot("prototype")
 MASS = 0.01
-UPRIGHT, TILTED = (
-    np.array([1.0, 0.0, 0.0, 0.0]),
-    np.array([0.9659258262890683, 0.25881904510252074, 0.0, 0.0]),
-)
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+TILTED = np.array([0.9659258262890683, 0.25881904510252074, 0.0, 0.0])
 SECONDS = 1.6  # of a block
 
 

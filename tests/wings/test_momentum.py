@@ -143,10 +143,8 @@ def test_a_pendulum_swings_with_its_rod(engine: str, mass: float, dt: float, tmp
     length, radius, angle = 0.2, 0.012, 0.2
     robot = small("passive", length=length, line_density=mass / length, body_radius=radius)
     stiff = replace(robot.segments[0], bending_stiffness=(50.0, 50.0), torsional_stiffness=50.0)
-    robot, mount = (
-        replace(robot, segments=(stiff,)),
-        {"position": (0.0, 0.0, -0.3), "quaternion": ROTATION["-z"]},
-    )
+    robot = replace(robot, segments=(stiff,))
+    mount = {"position": (0.0, 0.0, -0.3), "quaternion": ROTATION["-z"]}
     if engine == "pybullet":
         world = empty_world(dt, GRAVITY)
         (tmp_path / "p.urdf").write_text(URDF)

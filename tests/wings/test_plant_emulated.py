@@ -88,12 +88,10 @@ def test_line_weight_is_the_simulators() -> None:
 
 
 def test_tensions_change_with_the_wires_by_their_slope() -> None:
-    it, dl, force, h = (
-        PlantRod(compliance=3e-4, settling=0.3, weight=3.0),
-        tendons(0.3, 0.5),
-        np.array([0.2, 0.1, -0.5]),
-        1e-6,
-    )
+    it = PlantRod(compliance=3e-4, settling=0.3, weight=3.0)
+    dl = tendons(0.3, 0.5)
+    force = np.array([0.2, 0.1, -0.5])
+    h = 1e-6
     here = it.rest(dl, force, DOWN)
     for i, step in enumerate(h * np.eye(4)):
         ahead, behind = it.rest(dl + step, force, DOWN, here), it.rest(dl - step, force, DOWN, here)

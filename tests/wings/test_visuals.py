@@ -60,10 +60,8 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("link", [False, True])
 def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
-    points, faces = (
-        [[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]],
-        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
-    )
+    points = [[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]]
+    faces = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
     wedge = tmp_path / "wedge.obj"
     wedge.write_text(trimesh.Trimesh(points, faces).export(file_type="obj"))
     shape = {"fileName": str(wedge)} if kind == "mesh" else {}

@@ -262,10 +262,8 @@ def _picture(
                 n = 2 * margin + 1
                 paper, print_ = (_blurred(a, n, scene.blur) for a in (paper, print_))
             a, b = np.maximum(low, 0), np.minimum(high, camera.size)
-            seen, cut = (
-                np.s_[a[1] : b[1], a[0] : b[0]],
-                np.s_[a[1] - low[1] : b[1] - low[1], a[0] - low[0] : b[0] - low[0]],
-            )
+            seen = np.s_[a[1] : b[1], a[0] : b[0]]
+            cut = np.s_[a[1] - low[1] : b[1] - low[1], a[0] - low[0] : b[0] - low[0]]
             picture[seen] = picture[seen] * (1.0 - paper[cut]) + light[seen] * print_[cut]
     which, down, right = rng.integers(0, (_POOL, _SLACK, _SLACK))
     height, width = picture.shape

@@ -180,10 +180,8 @@ class SideFit:
         across = np.rint(crossed).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
         walked = np.broadcast_to(walked[:, :, None], across.shape)
         counts = np.broadcast_to((k <= n[:, None])[:, :, None], across.shape)
-        x, y = (
-            np.where(steep[:, None, None], across, walked).reshape(4, -1),
-            np.where(steep[:, None, None], walked, across).reshape(4, -1),
-        )
+        x = np.where(steep[:, None, None], across, walked).reshape(4, -1)
+        y = np.where(steep[:, None, None], walked, across).reshape(4, -1)
         inside = counts.reshape(4, -1) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1), inside  # type: ignore[return-value]
 

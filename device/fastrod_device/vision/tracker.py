@@ -285,15 +285,11 @@ class MarkerTracker:
                 orientation, shift, r, J, cost = new_orientation, new_shift, new_r, new_J, new_cost
             else:
                 each = better[:, None]
-                orientation, J = (
-                    np.where(each[..., None], new_orientation, orientation),
-                    np.where(each[..., None], new_J, J),
-                )
-                shift, r, cost = (
-                    np.where(each, new_shift, shift),
-                    np.where(each, new_r, r),
-                    np.where(better, new_cost, cost),
-                )
+                orientation = np.where(each[..., None], new_orientation, orientation)
+                J = np.where(each[..., None], new_J, J)
+                shift = np.where(each, new_shift, shift)
+                r = np.where(each, new_r, r)
+                cost = np.where(better, new_cost, cost)
             if done:
                 break
         return orientation, shift, cost
@@ -341,11 +337,9 @@ def _detector(marker: Marker) -> cv2.aruco.ArucoDetector:
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     options.minMarkerPerimeterRate = 0.06  # of the picture's longer side: noise has many small contours
     options.relativeCornerRefinmentWinSize = 0.4  # of a cell: the window must not reach the next
-    options.adaptiveThreshWinSizeMin, options.adaptiveThreshWinSizeMax, options.adaptiveThreshWinSizeStep = (
-        9,
-        29,
-        20,
-    )
+    options.adaptiveThreshWinSizeMin = 9
+    options.adaptiveThreshWinSizeMax = 29
+    options.adaptiveThreshWinSizeStep = 20
     return cv2.aruco.ArucoDetector(dictionary_named(marker.dictionary), options)
 
 

@@ -70,11 +70,9 @@ def _curvature(size: Vec, p: Vec) -> tuple[float, float, Vec]:
     u = unit(cross(n, (1.0, 0.0, 0.0) if abs(n[0]) < 0.6 else (0.0, 1.0, 0.0)), (0.0, 0.0, 1.0))[1]
     w = cross(n, u)
     # the second derivative of sum (x / r)^2, half of it, in the tangent plane
-    uu, uw, ww = (
-        dot(u, _over_squares(size, u)),
-        dot(u, _over_squares(size, w)),
-        dot(w, _over_squares(size, w)),
-    )
+    uu = dot(u, _over_squares(size, u))
+    uw = dot(u, _over_squares(size, w))
+    ww = dot(w, _over_squares(size, w))
     middle, half = 0.5 * (uu + ww), math.sqrt(0.25 * (uu - ww) ** 2 + uw * uw)
     first, second = (middle + half) / gradient, (middle - half) / gradient
     angle = 0.5 * math.atan2(2.0 * uw, uu - ww)  # of the direction of the first, from u

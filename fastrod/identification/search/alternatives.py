@@ -213,10 +213,8 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
             response = linearised.by_length @ pull
             blocks += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
         periods = span / wavelength
-        name, what = (
-            "ripple",
-            f"periodic in the tendons with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
-        )
+        name = "ripple"
+        what = f"periodic in the tendons with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear"
         if periods < _PERIODS:  # as many other laws look
             name = "wave"
             what = f"a wave of which the log covers {periods:.2g} periods, too few to name a cause"

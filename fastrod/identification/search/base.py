@@ -192,12 +192,10 @@ def check_motion(base: BaseFit, guess: str) -> None:
     robot, or in other units, as the sentence `guess` may say. Raises `LogError`."""
     state, samples, target = base.start, base.search.samples, base.search.target
     good = (target.weight > 0.0) & state.linearised.pose.ok
-    measured, predicted = (
-        target.tip[good],
-        state.linearised.seen(
-            state.model, state.theta, state.linearised.solved(state.model, state.theta)
-        ).position[good],
-    )
+    measured = target.tip[good]
+    predicted = state.linearised.seen(
+        state.model, state.theta, state.linearised.solved(state.model, state.theta)
+    ).position[good]
     if 2 * state.linearised.pose.ok.sum() < state.linearised.pose.ok.size or not np.isfinite(predicted).all():
         raise LogError(further_than_still(samples, base.robot, np.nan, guess))
     measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)

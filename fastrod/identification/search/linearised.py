@@ -131,13 +131,11 @@ class LinearisedModel:
         like: LinearisedModel | None = None,
     ) -> None:
         """`like`: a model nearby, from whose tension and bends it is solved."""
-        self.model, self.theta, self.samples, self.rod, self.target = (
-            model,
-            theta.copy(),
-            samples,
-            rod,
-            target,
-        )
+        self.model = model
+        self.theta = theta.copy()
+        self.samples = samples
+        self.rod = rod
+        self.target = target
         self.robot = model.robot_at(theta)
         near = None if like is None or like.samples is not samples else like.prepared
         self.prepared: PreparedLog = prepare_log(samples, self.robot, model.wiring, near)

@@ -239,13 +239,11 @@ class MotionModel:
     def __init__(
         self, model: Model, theta: Floats, samples: LogSamples, rod: MotionRod, target: Target
     ) -> None:
-        self.model, self.theta, self.samples, self.rod, self.target = (
-            model,
-            theta.copy(),
-            samples,
-            rod,
-            target,
-        )
+        self.model = model
+        self.theta = theta.copy()
+        self.samples = samples
+        self.rod = rod
+        self.target = target
 
     @cached_property
     def pose(self) -> PredictedPose:

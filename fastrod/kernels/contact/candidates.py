@@ -85,11 +85,9 @@ def renew_contacts(
 ) -> None:
     """The contacts of robot i for its next pass, from its candidates (`ContactRules.still`). `room` is for
     the centreline at each contact (max_contacts, 3) and the walls of a corner."""
-    contact, frames, curve = (
-        contacts.contact[i],
-        motion.frames[pick(i, len(motion.frames))],
-        curve_of(motion, i),
-    )
+    contact = contacts.contact[i]
+    frames = motion.frames[pick(i, len(motion.frames))]
+    curve = curve_of(motion, i)
     centre, wall = room
     margin = motion.margin * rods.length[i]
     face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)

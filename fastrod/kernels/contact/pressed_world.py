@@ -22,7 +22,7 @@ from .surface import surface_curvature
 from .tunnelling import carried
 
 SOFT = 1e-8
-"""R [m/N]: under 100 N a contact is a micrometre deep."""
+"""R of a rigid contact, at most [m/N]: under 100 N it is a micrometre deep."""
 _AT_LEAST = 0.01  # of a step: a place that is farther from the least gap is none where it is least
 
 
@@ -79,6 +79,8 @@ class Touching(NamedTuple):
     """Number of the first contact among these points."""
     yielding: float
     """Fraction of their mobility that free bodies have in this step: it goes by the square of its length."""
+    soft: Floats
+    """(n_robots,) R of their rigid contacts in this step [m/N]."""
 
 
 @kernel
@@ -411,7 +413,7 @@ def gather_world(
             for a in range(3):
                 axes[0, a], axes[1, a], axes[2, a] = n_axis[a], t1[a], t2[a]
             scatter(pressing.free[m], (contact.gap, dot(slip, t1), dot(slip, t2)))
-            law[0], law[1] = mu if slides else 0.0, SOFT + soft
+            law[0], law[1] = mu if slides else 0.0, all_of_it.soft[i] + soft
             law[2], law[3], law[4] = dot(held, t1), dot(held, t2), contact.slid
             if law[4] < 0.0:  # of a new contact: as far as its place has come
                 law[4] = math.sqrt(pressing.free[m, 1] ** 2 + pressing.free[m, 2] ** 2)

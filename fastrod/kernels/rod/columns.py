@@ -118,11 +118,9 @@ def column_position(column: Lanes, node: Lanes, stages: Lanes) -> None:
     """The change of position over the step that `step_column` has just done: Jacobians want it, the observer
     does not."""
     for w in range(W):
-        c2, c3, c4 = (
-            get_mat(stages, STAGE + S_C, w),
-            get_mat(stages, 2 * STAGE + S_C, w),
-            get_mat(stages, 3 * STAGE + S_C, w),
-        )
+        c2 = get_mat(stages, STAGE + S_C, w)
+        c3 = get_mat(stages, 2 * STAGE + S_C, w)
+        c4 = get_mat(stages, 3 * STAGE + S_C, w)
         tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
         change = add(cross(get(column, C_PHI_BEFORE, w), tangent), get(column, C_TANGENT, w))
         put(
@@ -137,19 +135,15 @@ def column_position(column: Lanes, node: Lanes, stages: Lanes) -> None:
 def add_length_changes(change: Lanes, column: Lanes, path: Lanes) -> None:
     """Change of the path length of GROUP tendons over the step, for one column."""
     for w in range(W):
-        du1, du2, du3, du4 = (
-            get(column, C_U, w),
-            get(column, C_U + 3, w),
-            get(column, C_U + 6, w),
-            get(column, C_U + 9, w),
-        )
+        du1 = get(column, C_U, w)
+        du2 = get(column, C_U + 3, w)
+        du3 = get(column, C_U + 6, w)
+        du4 = get(column, C_U + 9, w)
         for i in range(GROUP):
             p = i * PATHS + P_C
-            c1, c2, c3, c4 = (
-                get(path, p, w),
-                get(path, p + PATH, w),
-                get(path, p + 2 * PATH, w),
-                get(path, p + 3 * PATH, w),
-            )
+            c1 = get(path, p, w)
+            c2 = get(path, p + PATH, w)
+            c3 = get(path, p + 2 * PATH, w)
+            c4 = get(path, p + 3 * PATH, w)
             longer = dot(c1, du1) + dot(c2, du2) + dot(c3, du3) + dot(c4, du4)
             write(change, i, w, read(change, i, w) + longer)

@@ -223,11 +223,9 @@ def advance(node: Lanes, stages: Lanes) -> None:
     for w in range(W):
         h = read(node, N_H, w)
         rotation = get_mat(node, N_R, w)
-        c2, c3, c4 = (
-            get_mat(stages, STAGE + S_C, w),
-            get_mat(stages, 2 * STAGE + S_C, w),
-            get_mat(stages, 3 * STAGE + S_C, w),
-        )
+        c2 = get_mat(stages, STAGE + S_C, w)
+        c3 = get_mat(stages, 2 * STAGE + S_C, w)
+        c4 = get_mat(stages, 3 * STAGE + S_C, w)
         tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
         put(node, N_POS, w, axpy(h / 6.0, mul(rotation, tangent), get(node, N_POS, w)))
         put_mat(node, N_R, w, matmul(rotation, get_mat(stages, 4 * STAGE + S_C, w)))

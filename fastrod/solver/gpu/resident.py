@@ -71,10 +71,8 @@ class Resident:
 
         own, at = self.there(), _cuda.to_device(rows)
         for name in FIELDS:
-            into, values = (
-                getattr(own, name),
-                np.ascontiguousarray(getattr(new, name)[rows]) if len(getattr(new, name)) else None,
-            )
+            into = getattr(own, name)
+            values = np.ascontiguousarray(getattr(new, name)[rows]) if len(getattr(new, name)) else None
             if values is not None and values.size:
                 flat = _cuda.to_device(values.reshape(len(rows), -1))
                 launch(put_rows, len(rows), at, flat, into.reshape(into.shape[0], into.size // into.shape[0]))

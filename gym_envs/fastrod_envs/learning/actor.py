@@ -75,12 +75,10 @@ def load_actor(path: Path) -> Actor:
             "missing or too much."
         )
     weights, biases = [held[f"weight_{k}"] for k in range(n)], [held[f"bias_{k}"] for k in range(n)]
-    activation, squashed, middle, half_range = (
-        str(held["activation"]),
-        held["squashed"],
-        held["middle"],
-        held["reach"],
-    )
+    activation = str(held["activation"])
+    squashed = held["squashed"]
+    middle = held["middle"]
+    half_range = held["reach"]
     why = _misfit(weights, biases, middle, half_range)
     if activation not in get_args(Activation) or squashed.shape != () or squashed.dtype != np.bool_:
         why = f"its activation is {shown(activation, 40)} and squashed {shown(squashed.tolist(), 40)}"
@@ -128,17 +126,13 @@ def actor_of(model: Any) -> Actor:
 
     policy = model.policy
     if hasattr(policy, "mlp_extractor"):  # PPO
-        modules, features, squashed = (
-            [*policy.mlp_extractor.policy_net, policy.action_net],
-            policy.features_extractor,
-            False,
-        )
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+        features = policy.features_extractor
+        squashed = False
     elif hasattr(policy.actor, "latent_pi"):  # SAC
-        modules, features, squashed = (
-            [*policy.actor.latent_pi, policy.actor.mu],
-            policy.actor.features_extractor,
-            True,
-        )
+        modules = [*policy.actor.latent_pi, policy.actor.mu]
+        features = policy.actor.features_extractor
+        squashed = True
     else:  # TD3
         modules, features, squashed = list(policy.actor.mu), policy.actor.features_extractor, True
 

@@ -24,13 +24,11 @@ from fastrod_envs.learning.presets import ALGORITHMS, NETWORK, check_settings, p
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
-CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = (
-    "config.json",
-    "policy.zip",
-    "actor.npz",
-    "checkpoint.npz",
-    "replay.npz",
-)
+CONFIG = "config.json"
+POLICY = "policy.zip"
+ACTOR = "actor.npz"
+CHECKPOINT = "checkpoint.npz"
+REPLAY = "replay.npz"
 FOREIGN = ("checkpoint.zip", POLICY)
 """Files of stable-baselines3: to read one runs code of whoever made it."""
 _EVERY = 20  # checkpoints of a training
@@ -230,10 +228,8 @@ def _run(plan: TrainingPlan, out: Path, progress: Progress | None, trust: bool =
 
         def note() -> None:
             _save(model, out)
-            state["steps_done"], state["seconds"] = (
-                int(model.num_timesteps),
-                before + time.monotonic() - started,
-            )
+            state["steps_done"] = int(model.num_timesteps)
+            state["seconds"] = before + time.monotonic() - started
             _write_config(out, plan, state)
 
         left = plan.steps - model.num_timesteps

@@ -358,10 +358,8 @@ class _Inside(Cell):
         rows, columns = np.nonzero(hue @ _HUES[self.corner] > _ALIKE)
         if not len(rows):
             return np.zeros(3)
-        right, up = (
-            (columns.mean() + 0.5) / (0.5 * _SMALL.width) - 1.0,
-            1.0 - (rows.mean() + 0.5) / (0.5 * _SMALL.height),
-        )
+        right = (columns.mean() + 0.5) / (0.5 * _SMALL.width) - 1.0
+        up = 1.0 - (rows.mean() + 0.5) / (0.5 * _SMALL.height)
         return np.array([right, up, len(rows) / rgb[..., 0].size])
 
 

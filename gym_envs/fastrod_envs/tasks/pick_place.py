@@ -161,11 +161,9 @@ class _Table(Cell):
     kinematics and pictures."""
 
     def __init__(self, task: PickPlace) -> None:
-        self.grip, self.at_once, self.accuracy = (
-            task.grip,
-            task.options.action == "displacement",
-            task.accuracy,
-        )
+        self.grip = task.grip
+        self.at_once = task.options.action == "displacement"
+        self.accuracy = task.accuracy
         self.n_substeps = max(1, math.ceil(task.dt / _SUBSTEP - 1e-9))
         self.n_steps = max(1, math.ceil(task.dt / self.n_substeps / _DT - 1e-9))
         self.step = task.dt / (self.n_substeps * self.n_steps)
@@ -227,15 +225,11 @@ class _Table(Cell):
         self._first = float(np.linalg.norm(self.place - self.spot))
 
     def act(self, action: Floats, duration: float) -> None:
-        velocity, bend_rate, substep = (
-            SPEED * action[:3],
-            BEND_RATE * float(action[3]),
-            duration / self.n_substeps,
-        )
-        to, bend = (
-            0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * action[:3],
-            BEND * float(action[3]),
-        )
+        velocity = SPEED * action[:3]
+        bend_rate = BEND_RATE * float(action[3])
+        substep = duration / self.n_substeps
+        to = 0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * action[:3]
+        bend = BEND * float(action[3])
         self._command(bool(action[4] > 0.0))
         for _ in range(self.n_substeps):
             if self.at_once:
@@ -444,20 +438,16 @@ def _flange(tip: Floats, bend: float, length: float) -> Floats:
 def _furnish(b: Bullet, width: float) -> tuple[int, int, Gripper]:
     """Table; the cube, the spot and the gripper that this returns."""
     middle, half = _TABLE
-    shape, seen = (
-        b.createCollisionShape(b.GEOM_BOX, halfExtents=half),
-        b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[*_WOOD, 1.0]),
-    )
+    shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=half)
+    seen = b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[*_WOOD, 1.0])
     b.createMultiBody(0.0, shape, seen, middle)
     plinth = b.createVisualShape(
         b.GEOM_BOX, halfExtents=[0.12, 0.22, 0.5 * TOP - 0.01], rgbaColor=[0.45, 0.47, 0.50, 1.0]
     )
     b.createMultiBody(0.0, -1, plinth, [*middle[:2], 0.5 * TOP - 0.01])
     edge = [0.5 * SIDE] * 3
-    shape, seen = (
-        b.createCollisionShape(b.GEOM_BOX, halfExtents=edge),
-        b.createVisualShape(b.GEOM_BOX, halfExtents=edge, rgbaColor=[*_ORANGE, 1.0]),
-    )
+    shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=edge)
+    seen = b.createVisualShape(b.GEOM_BOX, halfExtents=edge, rgbaColor=[*_ORANGE, 1.0])
     cube: int = b.createMultiBody(_MASS, shape, seen, [0.5, 0.0, TOP + 0.5 * SIDE])
     b.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     disc = b.createVisualShape(b.GEOM_CYLINDER, radius=0.03, length=0.001, rgbaColor=[*_GREEN, 1.0])

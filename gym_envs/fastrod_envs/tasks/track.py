@@ -147,12 +147,10 @@ class Track(RodTask):
         self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=RADIUS)
         self.goals, self.states = fields(self.base_robot)
         n = n_envs
-        self._which, self._phase, self._sense, self._size = (
-            np.zeros(n, np.int64),
-            np.zeros(n),
-            np.ones(n),
-            np.ones(n),
-        )
+        self._which = np.zeros(n, np.int64)
+        self._phase = np.zeros(n)
+        self._sense = np.ones(n)
+        self._size = np.ones(n)
         self._t = np.zeros(n)
         self._sight = TrackSight(n)
         self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)

@@ -76,10 +76,8 @@ class _Look(SceneStage):
         """Picture of the camera in the tip, which looks along the neck; d1 is up in it."""
         state = self.rod.state
         assert state is not None
-        axes, eye = (
-            state.tip_rotation[0],
-            state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2],
-        )
+        axes = state.tip_rotation[0]
+        eye = state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2]
         return self.camera.look(self.world, eye, eye + axes[:, 2], axes[:, 0])
 
 
@@ -135,14 +133,12 @@ class NeckLook(HostedScene):
         world, rod = stage.world, stage.rod
         stood = np.array(world.getBasePositionAndOrientation(stage.mount.body)[0])
         outside = self._look(stage, Seen(np.zeros(4, np.int64), 0.0))
-        seen, clearance, force, gave, lowest, weighed = (
-            Seen(np.zeros(4, np.int64), 0.0),
-            math.inf,
-            0.0,
-            0.0,
-            math.inf,
-            0.0,
-        )
+        seen = Seen(np.zeros(4, np.int64), 0.0)
+        clearance = math.inf
+        force = 0.0
+        gave = 0.0
+        lowest = math.inf
+        weighed = 0.0
         carried, before = 0.0, stage.robot.length
         for t in self.play(stage):
             state = rod.state

@@ -174,13 +174,11 @@ def _floor_force(world: Bullet, body: int) -> NDArray[np.float64]:
     other body."""
     total = np.zeros(3)
     for contact in world.getContactPoints(bodyA=body):
-        normal, size, first, along, second, across = (
-            contact[7],
-            contact[9],
-            contact[10],
-            contact[11],
-            contact[12],
-            contact[13],
-        )
+        normal = contact[7]
+        size = contact[9]
+        first = contact[10]
+        along = contact[11]
+        second = contact[12]
+        across = contact[13]
         total += size * np.array(normal) - first * np.array(along) - second * np.array(across)
     return total

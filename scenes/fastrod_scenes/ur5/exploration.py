@@ -215,10 +215,8 @@ class Exploration(SceneStage):
         if not len(rows):
             return 0, 0.0
         pixel = 2.0 * np.tan(0.5 * np.radians(self.camera.fov)) / self.camera.height
-        x, y = (
-            pixel * (columns + 0.5 - 0.5 * self.camera.width),
-            pixel * (0.5 * self.camera.height - rows - 0.5),
-        )
+        x = pixel * (columns + 0.5 - 0.5 * self.camera.width)
+        y = pixel * (0.5 * self.camera.height - rows - 0.5)
         rays = np.stack([x, y, -np.ones(len(x))], axis=1) @ look.rotation.T
         points = look.eye + image.depth[rows, columns][:, None] * rays
         return len(rows), float(self.box.off_cube(corner, points).max())

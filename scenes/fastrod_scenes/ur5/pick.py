@@ -84,10 +84,8 @@ class _Pick(HostedScene):
             )
             self.expect(stage.mass == mass, f"{at} the cube has {stage.mass:.3g} kg; it had {mass:.3g} kg.")
             if phase == "rest":
-                away, gap = (
-                    stage.clearance(stage.soft, stage.cube),
-                    stage.clearance([stage.cube], stage.table),
-                )
+                away = stage.clearance(stage.soft, stage.cube)
+                gap = stage.clearance([stage.cube], stage.table)
         height, sideways, base, bend = np.array(carried).T
         lifted, displacement, by_arm, bent = height.min(), np.ptp(sideways), np.ptp(base), np.ptp(bend)
         self.expect(

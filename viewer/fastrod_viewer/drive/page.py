@@ -203,10 +203,8 @@ class DrivePage(ViewerPage):
             if self.world.ringing is not None:
                 self._slow_motion()
             tabs = gui.add_tab_group()
-            drive, loads = (
-                tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS),
-                tabs.add_tab("Loads", viser.Icon.WEIGHT),
-            )
+            drive = tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS)
+            loads = tabs.add_tab("Loads", viser.Icon.WEIGHT)
             self.controls = ControlPanel(self.server, session, drive, loads, may=self._may)
             with tabs.add_tab("View", viser.Icon.EYE):
                 self._view()

@@ -24,26 +24,20 @@ def quaternions(rotation: Floats, found: Floats) -> None:
             if trace > max(r[0, 0], r[1, 1], r[2, 2]):
                 q[0], q[1], q[2], q[3] = 1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
             elif r[0, 0] >= max(r[1, 1], r[2, 2]):
-                q[0], q[1], q[2], q[3] = (
-                    r[2, 1] - r[1, 2],
-                    1.0 + 2.0 * r[0, 0] - trace,
-                    r[0, 1] + r[1, 0],
-                    r[0, 2] + r[2, 0],
-                )
+                q[0] = r[2, 1] - r[1, 2]
+                q[1] = 1.0 + 2.0 * r[0, 0] - trace
+                q[2] = r[0, 1] + r[1, 0]
+                q[3] = r[0, 2] + r[2, 0]
             elif r[1, 1] >= r[2, 2]:
-                q[0], q[1], q[2], q[3] = (
-                    r[0, 2] - r[2, 0],
-                    r[0, 1] + r[1, 0],
-                    1.0 + 2.0 * r[1, 1] - trace,
-                    r[1, 2] + r[2, 1],
-                )
+                q[0] = r[0, 2] - r[2, 0]
+                q[1] = r[0, 1] + r[1, 0]
+                q[2] = 1.0 + 2.0 * r[1, 1] - trace
+                q[3] = r[1, 2] + r[2, 1]
             else:
-                q[0], q[1], q[2], q[3] = (
-                    r[1, 0] - r[0, 1],
-                    r[0, 2] + r[2, 0],
-                    r[1, 2] + r[2, 1],
-                    1.0 + 2.0 * r[2, 2] - trace,
-                )
+                q[0] = r[1, 0] - r[0, 1]
+                q[1] = r[0, 2] + r[2, 0]
+                q[2] = r[1, 2] + r[2, 1]
+                q[3] = 1.0 + 2.0 * r[2, 2] - trace
             size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
             if j > 0:
                 before = found[i, j - 1]
@@ -131,28 +125,20 @@ def offset_pieces(
             k = source[c]
             x, y = offset[row, c, 0], offset[row, c, 1]
             for j in range(n_pieces + 1):
-                a, b, u, v = (
-                    orientation[i, k, j, 0],
-                    orientation[i, k, j, 1],
-                    orientation[i, k, j, 2],
-                    orientation[i, k, j, 3],
-                )
+                a = orientation[i, k, j, 0]
+                b = orientation[i, k, j, 1]
+                u = orientation[i, k, j, 2]
+                v = orientation[i, k, j, 3]
                 d[0], point[0] = d[1], point[1]
-                d[1, 0, 0], d[1, 0, 1], d[1, 0, 2] = (
-                    1.0 - 2.0 * (u * u + v * v),
-                    2.0 * (b * u + a * v),
-                    2.0 * (b * v - a * u),
-                )
-                d[1, 1, 0], d[1, 1, 1], d[1, 1, 2] = (
-                    2.0 * (b * u - a * v),
-                    1.0 - 2.0 * (b * b + v * v),
-                    2.0 * (u * v + a * b),
-                )
-                d[1, 2, 0], d[1, 2, 1], d[1, 2, 2] = (
-                    2.0 * (b * v + a * u),
-                    2.0 * (u * v - a * b),
-                    1.0 - 2.0 * (b * b + u * u),
-                )
+                d[1, 0, 0] = 1.0 - 2.0 * (u * u + v * v)
+                d[1, 0, 1] = 2.0 * (b * u + a * v)
+                d[1, 0, 2] = 2.0 * (b * v - a * u)
+                d[1, 1, 0] = 2.0 * (b * u - a * v)
+                d[1, 1, 1] = 1.0 - 2.0 * (b * b + v * v)
+                d[1, 1, 2] = 2.0 * (u * v + a * b)
+                d[1, 2, 0] = 2.0 * (b * v + a * u)
+                d[1, 2, 1] = 2.0 * (u * v - a * b)
+                d[1, 2, 2] = 1.0 - 2.0 * (b * b + u * u)
                 for e in range(3):
                     point[1, e] = at[i, k, j, e] + x * d[1, 0, e] + y * d[1, 1, e]
                 if j == 0:
@@ -172,22 +158,16 @@ def offset_pieces(
                     along[i, c, j - 1] = q
                     continue
                 # the shortest rotation from the rod's middle tangent to the chord, then the rod's: r q
-                mx, my, mz = (
-                    2.0 * (q[1] * q[3] + q[0] * q[2]),
-                    2.0 * (q[2] * q[3] - q[0] * q[1]),
-                    1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2),
-                )
-                cx, cy, cz = (
-                    (point[1, 0] - point[0, 0]) / size,
-                    (point[1, 1] - point[0, 1]) / size,
-                    (point[1, 2] - point[0, 2]) / size,
-                )
-                w, rx, ry, rz = (
-                    1.0 + mx * cx + my * cy + mz * cz,
-                    my * cz - mz * cy,
-                    mz * cx - mx * cz,
-                    mx * cy - my * cx,
-                )
+                mx = 2.0 * (q[1] * q[3] + q[0] * q[2])
+                my = 2.0 * (q[2] * q[3] - q[0] * q[1])
+                mz = 1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2)
+                cx = (point[1, 0] - point[0, 0]) / size
+                cy = (point[1, 1] - point[0, 1]) / size
+                cz = (point[1, 2] - point[0, 2]) / size
+                w = 1.0 + mx * cx + my * cy + mz * cz
+                rx = my * cz - mz * cy
+                ry = mz * cx - mx * cz
+                rz = mx * cy - my * cx
                 norm = math.sqrt(w * w + rx * rx + ry * ry + rz * rz)
                 w, rx, ry, rz = w / norm, rx / norm, ry / norm, rz / norm
                 along[i, c, j - 1, 0] = w * q[0] - rx * q[1] - ry * q[2] - rz * q[3]

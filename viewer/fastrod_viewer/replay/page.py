@@ -252,11 +252,9 @@ class ReplayPage(ViewerPage):
     def _set(
         self, *, speed: float | None = None, choice: str | None = None, magnify: str | None = None
     ) -> None:
-        self._speed, self.choice, self._magnify = (
-            speed or self._speed,
-            choice or self.choice,
-            magnify or self._magnify,
-        )
+        self._speed = speed or self._speed
+        self.choice = choice or self.choice
+        self._magnify = magnify or self._magnify
         self.frame = -1
         self._wake.set()
 

@@ -310,10 +310,8 @@ def base_step(robots: Ints, host: ModalHost, b: ModalBasis, motion: ModalMotion,
                 write_at(matrix, r, c, w, rigid_stiffness(work, r, c, w))
             for a in range(n_q):
                 for w in range(W):
-                    one, other = (
-                        read(work.host_change, r * n_q + a, w),
-                        read(work.host_change, c * n_q + a, w),
-                    )
+                    one = read(work.host_change, r * n_q + a, w)
+                    other = read(work.host_change, c * n_q + a, w)
                     write_at(matrix, r, c, w, at(matrix, r, c, w) - one * other)
             for w in range(W):
                 stiffness, i = at(matrix, r, c, w), robots[w]
