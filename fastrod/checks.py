@@ -76,6 +76,10 @@ def _figure(x: float) -> str:
 
 POSITIVE = Bound(above=0.0)
 NOT_NEGATIVE = Bound(least=0.0)
+COUNT = Bound(least=1, infinite=True)  # however large: what is too many is said where it is known
+
+
+_KINDS: dict[type, Any] = {int: (int, np.integer), float: (int, float, np.integer, np.floating)}
 
 
 class Declared(NamedTuple):
@@ -86,23 +90,77 @@ class Declared(NamedTuple):
     choices: tuple[Any, ...] = ()
     bound: Bound = Bound()
     optional: bool = False
+    numbers: int = 0
+    """Numbers of a tuple or a list; 0: one number, by itself."""
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value is one of these."""
+        kind, choices, bound, optional, count = self
+        if type(value) is float and kind is float:
+            return not count and bound.holds(value)
+        if value is None and optional:
+            return True
+        if kind is None:
+            return any(value is one or (isinstance(value, type(one)) and value == one) for one in choices)
+        if kind is bool:
+            return isinstance(value, (bool, np.bool_))
+        if count and not (isinstance(value, (tuple, list, np.ndarray)) and len(value) == count):
+            return False
+        each = value if count else (value,)
+        return all(
+            isinstance(x, _KINDS[kind]) and type(x) is not bool and bound.holds(_plain(x)) for x in each
+        )
+
+    def sentence(self, name: str, value: Any) -> str:
+        """Return what is wrong with a value that is none of these."""
+        kind, choices, bound, optional, count = self
+        none = ", or None" if optional else ""
+        if kind is None:
+            how = nearest(str(value), tuple(map(str, choices))) if isinstance(value, str) else ""
+            right = how if how.startswith("did") else f"it must be {' or '.join(map(repr, choices))}{none}."
+            return f"{name} is {shown(value)}; {right}"
+        if kind is bool:
+            return f"{name} is {shown(value)}; it must be True or False{none}."
+        each: Any = value if count and isinstance(value, (tuple, list)) else (value,)
+        most = min(bound.most, bound.below)
+        large = any(isinstance(x, _KINDS[kind]) and not -most <= x <= most for x in each)
+        hint = f" {bound.hint}" if bound.hint and large else ""
+        unit = f" {bound.unit}" if bound.unit else ""
+        one = "a whole number" if kind is int else "a number"
+        right = bound.right(f"{count} numbers" if count else one)
+        return f"{name} is {shown(value)}{unit}; it must be {right}{none}.{hint}"
+
+
+def _plain(x: Any) -> Any:
+    return x.item() if isinstance(x, np.generic) else x
 
 
 _KNOWN: dict[type, Mapping[str, Declared]] = {}  # read once
 
 
-def check(given: Any, prefix: str | None = None) -> None:
-    """Raise `InputError` for the first field of a dataclass that is not what it declares: a number of its
-    `Bound`, True or False, one of its `Literal`. `prefix` stands before the field's name in the sentence, by
-    default the class and a dot."""
+def check(given: Any, prefix: str | None = None, error: type[FastrodError] = InputError) -> None:
+    """Raise `error` for the first field of a dataclass that is not what it declares: a number of its `Bound`,
+    so many of them, True or False, one of its `Literal`. `prefix` stands before the field's name in the
+    sentence, by default the class and a dot."""
     before = f"{type(given).__name__}." if prefix is None else prefix
     for name, declared in declared_by(type(given)).items():
-        check_value(f"{before}{name}", getattr(given, name), declared)
+        if not declared.holds(value := getattr(given, name)):
+            raise error(declared.sentence(f"{before}{name}", value))
 
 
-def check_number(name: str, value: object, bound: Bound = POSITIVE, *, whole: bool = False) -> None:
-    """Raise `InputError` unless this is a number within the bound."""
-    check_value(name, value, Declared(int if whole else float, (), bound))
+def check_number(
+    name: str,
+    value: object,
+    bound: Bound = POSITIVE,
+    *,
+    whole: bool = False,
+    count: int = 0,
+    error: type[FastrodError] = InputError,
+) -> None:
+    """Raise `error` unless this is a number within the bound, or so many of them."""
+    declared = Declared(int if whole else float, (), bound, numbers=count)
+    if not declared.holds(value):
+        raise error(declared.sentence(name, value))
 
 
 def checked_array(name: str, value: ArrayLike, shapes: Sequence[tuple[int, ...]], says: str) -> _Array:
@@ -130,32 +188,6 @@ def checked_pose(name: str, value: ArrayLike, *rows: int, off: float = 1e-6) -> 
         worst = norm.ravel()[beyond.argmax()]
         raise InputError(f"{name} has a quaternion of norm {worst:.6g}; it must be 1, as w x y z.")
     return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)
-
-
-def check_value(name: str, value: Any, declared: Declared) -> None:
-    """Raise `InputError` where a value is not what was declared."""
-    kind, choices, bound, optional = declared
-    if value is None and optional:
-        return
-    none = ", or None" if optional else ""
-    if kind is None:
-        if not any(value is one or (isinstance(value, type(one)) and value == one) for one in choices):
-            words = tuple(map(str, choices))
-            how = nearest(str(value), words) if isinstance(value, str) else ""
-            right = how if how.startswith("did") else f"it must be {' or '.join(map(repr, choices))}{none}."
-            raise InputError(f"{name} is {shown(value)}; {right}")
-        return
-    if kind is bool:
-        if not isinstance(value, bool):
-            raise InputError(f"{name} is {shown(value)}; it must be True or False{none}.")
-        return
-    kinds = (int, np.integer) if kind is int else (int, float, np.integer, np.floating)
-    number = isinstance(value, kinds) and not isinstance(value, bool)
-    if not number or not bound.holds(value.item() if isinstance(value, np.generic) else value):
-        hint = f" {bound.hint}" if number and bound.hint and value > min(bound.most, bound.below) else ""
-        unit = f" {bound.unit}" if bound.unit else ""
-        right = bound.right("a whole number" if kind is int else "a number")
-        raise InputError(f"{name} is {shown(value)}{unit}; it must be {right}{none}.{hint}")
 
 
 def named_fields(error: type[FastrodError]) -> Callable[[type[_Class]], type[_Class]]:
@@ -204,6 +236,8 @@ def _declared(kind: Any) -> Declared | None:
     if get_origin(kind) is Annotated:
         inner, *more = get_args(kind)
         bound = next((one for one in more if isinstance(one, Bound)), None)
+        if bound is not None and get_origin(inner) is tuple:
+            return Declared(float, (), bound, numbers=len(get_args(inner)))
         declared = _declared(inner) or Declared(int if int in (inner, *get_args(inner)) else float)
         optional = NoneType in get_args(inner)
         return None if bound is None else declared._replace(bound=bound, optional=optional)

@@ -279,7 +279,7 @@ WRONG = {
     "calibrate --emulate --square 20": "CharucoBoard.marker is 15.0 m, square 20.0 m",
     "calibrate --emulate --dictionary DICT_5X5_10": "did you mean 'DICT_5X5_100'?",
     "calibrate --emulate --out camera.csv": "does not end in .toml",
-    "calibrate --emulate --seed -1": "seed is -1; it must be a whole number from 0",
+    "calibrate --emulate --seed -1": "seed is -1; it must be a whole number, zero or positive",
     "register --camera 1": "say where the board is, base_from_board: --at X Y Z QW QX QY QZ",
     "register --emulate --at 1 2 3": "argument --at: expected 7 arguments",
     "register --emulate --at 20 0 0 1 0 0 0": "the board is more than 3 m away. Was it given in mm?",

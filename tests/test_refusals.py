@@ -259,7 +259,7 @@ MOTION: Rows = [
     *(
         (
             lambda name=name, value=value: Modal(modes=Modes(**{name: value})),
-            f"^modes has {name}={value!r}; give a whole number from 1 to {16 if name == 'pieces' else 8}",
+            f"^modes.{name} is {value!r}; .* a whole number from 1 to {16 if name == 'pieces' else 8}",
         )
         for name, value in (("bending", 0), ("torsion", 9), ("strain", 1.5), ("pieces", "two"))
     ),
@@ -270,20 +270,18 @@ MOTION: Rows = [
     (lambda: moving(solver=Observer()), "^dynamics was given beside a solver; give solver=fastrod.Modal"),
     (lambda: moving(solver=Modal(), dynamics=False, scheme="bdf2"), "^scheme was given beside a solver"),
     *(
-        (lambda n=n: moving().step(REST, passes=n), f"^passes is {n!r}; give a whole number from 1 to 100")
+        (lambda n=n: moving().step(REST, passes=n), f"^passes is {n!r}; .* a whole number from 1 to 100")
         for n in (0, 101, 1.5, "two")
     ),
     (lambda: Simulator(rod()).step(REST, passes=2), "^passes is 2; the observer takes one a step"),
     (lambda: moving().step(REST, extension=[0.01]), r"^extension \[0.01\] m lies outside the range"),
     (lambda: moving().frequencies(), "^frequencies needs a state; call step or settle first"),
     (lambda: settled(rod()).frequencies(), "^frequencies needs inertia; give Simulator"),
-    (lambda: settled_moving().frequencies(0), "^count is 0; give a whole number, at least 1"),
+    (lambda: settled_moving().frequencies(0), "^count is 0; it must be a whole number, at least 1"),
     (lambda: settled_moving().frequencies(99), "^count is 99; these rods have 10 unknowns: give more modes"),
 ]
 
 ROBOTS: Rows = [
-    (lambda: Lump(at=-0.01, mass=0.1), "^Lump.at is -0.01 m; it must lie on its segment"),
-    (lambda: Lump(at=0.01, mass=0.1, inertia=1.0), "^Lump.inertia is 1.0; give the three moments"),
     (lambda: Lump(at=0.01, mass=0.1, inertia=(1.0, 1.0, 3.0)), "no body has it"),
     (lambda: rod(lumps=(Lump(at=0.08, mass=0.1),)), "^Lump.at is 0.08 m, beyond the 0.07 m of its segment"),
     (lambda: rod(lumps=(0.1,)), r"^Segment.lumps is \(0.1,\); give a tuple of Lump"),
@@ -291,27 +289,14 @@ ROBOTS: Rows = [
         lambda: Simulator([rod(lumps=(Lump(at=0.01, mass=0.1),)), rod()]),
         "^robot 1 of the batch has lumps on other segments than robot 0, or more or fewer",
     ),
-    *(
-        (lambda name=name, value=value: rod(**{name: value}), rf"^Segment\.{name} is .*; it must be ")
-        for name, value in (
-            *(
-                ("damping_time", -1e-3),
-                ("damping_time", "long"),
-                ("axial_stiffness", 0.0),
-                ("length", 1e-300),
-            ),
-            *(("shear_stiffness", math.nan), ("torsional_stiffness", 1e200), ("line_density", 1e300)),
-        )
+    (
+        lambda: Tendon(offset=5e-324, angle=0.0),
+        "^Tendon.offset is 5e-324 m; it must be a number from 1e-06 to",
     ),
-    *(
-        (
-            lambda given=given: Tendon(**{"offset": 0.01, "angle": 0.0} | given),
-            r"^Tendon\.\w+ is .*; it must be ",
-        )
-        for given in ({"offset": 5e-324}, {"compliance": 1e300}, {"pretension": 1e300})
+    (
+        lambda: rod(bending_stiffness=(1e-300, 1.0)),
+        r"\(1e-300, 1.0\) N m\^2; it must be 2 numbers from 1e-20 to",
     ),
-    (lambda: rod(bending_stiffness=(1e-300, 1.0)), r"1e-300 N m\^2; it must be between 1e-20 and 1e\+15"),
-    (lambda: Lump(at=0.01, mass=-0.1), "^Lump.mass is -0.1 kg; it must be zero or positive"),
     (lambda: loads(A + "lumps = [{at = 0.01, mas = 0.1}]\n" + TENDON + "}]"), "did you mean 'mass'"),
     (lambda: loads(A + "lumps = [{at = 0.01}]\n" + TENDON + "}]"), "mass"),
     (lambda: loads(A + "damping_tme = 0.1\n" + TENDON + "}]"), "did you mean 'damping_time'"),
@@ -320,7 +305,7 @@ ROBOTS: Rows = [
     (lambda: loads('name = "a"\nlenght = 3\n'), "unknown key 'lenght'"),
     (lambda: loads(A.replace("length", "lenght")), "did you mean 'length'"),
     (lambda: loads(A.replace("0.07", "70")), "Was it given in mm"),
-    (lambda: loads(A.replace("0.07", "-0.07")), "must be positive"),
+    (lambda: loads(A.replace("0.07", "-0.07")), "length is -0.07 m; it must be a number from 1e-06 to 10 m"),
     (lambda: loads(A.replace("0.07", '"long"')), "length: Expected 'float'"),
     (lambda: loads(A + 'mode = "tendon_lenght"'), "tendon_length"),
     (lambda: loads(A + TENDON + ", colour = 1}]"), "unknown key 'colour'"),
@@ -378,7 +363,7 @@ ROBOTS: Rows = [
     ),
     (
         lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)),
-        r"Robot.gravity is \[0.0, 0.0, 1e\+300\]; its numbers must be between",
+        r"Robot.gravity is \(0.0, 0.0, 1e\+300\); it must be 3 numbers from -1e\+09",
     ),
     *(
         (
@@ -407,7 +392,7 @@ OTHERS: Rows = [
     ),
     (
         lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], longest=0.0),
-        "longest is 0.0 m; it must be positive",
+        "longest is 0.0 m; it must be a number, positive",
     ),
     (lambda: touching().state.contacts.in_contact("bal"), "no obstacle 'bal'; did you mean 'ball'"),
     (
@@ -418,11 +403,6 @@ OTHERS: Rows = [
         lambda: touching().step(REST, obstacle_pose={"ball": [math.nan] * 7}),
         "holds a value that is not finite",
     ),
-    (lambda: scene(rod_friction=-1.0), "rod_friction is -1.0; it must be zero or positive"),
-    (lambda: scene(max_contacts=65), "max_contacts is 65; it must be a whole number from 1 to 64"),
-    (lambda: scene(max_iterations=3), "max_iterations is 3; it must be a whole number, at least 20"),
-    (lambda: scene(watch=0.5), "watch is 0.5; it is a fraction of the rod's length"),
-    (lambda: scene(mounting=-0.1), "mounting is -0.1 m; it must be zero or positive"),
     (
         lambda: Simulator(rod(), contact=scene(rod_radius=(1.0, 2.0))),
         "rod_radius is .*; give one radius or 1, one a segment",
@@ -431,7 +411,7 @@ OTHERS: Rows = [
         lambda: plan(rod(), np.zeros((3, 3)), 0.1, start="there"),
         r"start is not an array of numbers; give \(4,\), one change",
     ),
-    (lambda: demo(None, seed=-1), "seed is -1; it must be a whole number from 0"),
+    (lambda: demo(None, seed=-1), "seed is -1; it must be a whole number, zero or positive"),
     (lambda: recorder(math.nan), "a recording begins at t = nan; it must be a finite time"),
     (lambda: recorder().add(reading(math.inf)), "the reading has t = inf; a row needs a finite time"),
     (
@@ -445,15 +425,12 @@ OTHERS: Rows = [
         "points_per_segment is 0; it must be 1 or more",
     ),
     (lambda: reference.shoot(rod(), REST, guess=of_another_shape()), "guess is the shape of another robot"),
-    (lambda: segment(bending_stiffness=0.002), "bending_stiffness is 0.002; give two values, EI_x and EI_y"),
-    (lambda: segment(precurvature=(1.0, 2.0)), r"precurvature is \[1.0, 2.0\]; it must be 3 finite numbers"),
     (
         lambda: segment(extension=(-0.1, 0.0)),
         r"extension is \[-0.1, 0.0\] m; give \[smallest, largest\] change",
     ),
     (lambda: segment(mode="tendon_lenght"), "mode is 'tendon_lenght'; did you mean 'tendon_length'"),
     (lambda: segment(mode="passive"), "A passive segment has no tendons; it was given 1"),
-    (lambda: segment(body_radius=-1.0), "body_radius is -1.0 m; it must be between 0 and"),
     (
         lambda: Robot(name="r", segments=(segment(length=0.005),)),
         "Tendon offset 0.007 m of segment 1 is larger than the length 0.005 m",

@@ -38,10 +38,12 @@ def test_a_material_is_the_closed_form_of_a_round_rod() -> None:
 @refusals(
     {
         RobotError: {
-            "radius is -1 m; it must be positive": lambda: fastrod.Segment.from_material(
+            "radius is -1 m; it must be a number from 1e-06 to 10 m.": lambda: fastrod.Segment.from_material(
                 **(STEEL | {"radius": -1})
             ),
-            "poisson is 0.7; Poisson's ratio": lambda: fastrod.Segment.from_material(**STEEL, poisson=0.7),
+            "poisson is 0.7; it must be a number between -1 and 0.5.": lambda: fastrod.Segment.from_material(
+                **STEEL, poisson=0.7
+            ),
             "density is -1 kg/m": lambda: fastrod.Segment.from_material(**STEEL, density=-1),
         },
         InputError: {"view shows a Simulator; it was given Robot": lambda: fastrod.view(one_segment())},

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
@@ -55,8 +56,7 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
                 f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over."
             )
     missing = [name for name, module in _DEVICE.items() if find_spec(module) is None]
-    if seed is not None and seed < 0:
-        raise InputError(f"seed is {seed}; it must be a whole number from 0.")
+    check_number("seed", seed or 0, NOT_NEGATIVE, whole=True)
     console = Console()
     robot = load_robot("prototype")
     _batch(robot, console)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fastrod.checks import COUNT, Bound, check_number
 from fastrod.commands.parser import Actions, Pairs
 from fastrod.commands.terminal import DONE, need, progress
 from fastrod.errors import InputError
@@ -44,8 +45,7 @@ class DataSet:
         need("generate", "parquet", "pyarrow")
         if self.ray is not None:
             need("generate --ray", "ray", "ray")
-        if self.shard_rows is not None and self.shard_rows < 1:
-            raise InputError(f"--shard-rows is {self.shard_rows}; it must be at least 1.")
+        check_number("--shard-rows", 1 if self.shard_rows is None else self.shard_rows, COUNT, whole=True)
 
     def make(self, work: Any) -> int:
         """Make it, and print the summary."""
@@ -89,8 +89,7 @@ def shapes(
     """
     from fastrod.generation.shapes import Shapes
 
-    if force is not None and force < 0.0:
-        raise InputError(f"--force is {force!r} N; it must be zero or positive.")
+    check_number("--force", force or 0.0, Bound(least=0.0, unit="N"))
     words = _given(
         bend=bend,
         force=force,

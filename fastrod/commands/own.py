@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError, LogError, nearest
 from fastrod.logs.table import DATE, Table, read_table
 from fastrod.model.logformat import UNITS
@@ -214,8 +215,7 @@ def export(robot: str, *, mjcf: Path, pieces: int | None = None) -> int:
     its = load_robot(robot)
     if mjcf.suffix != ".xml":
         raise InputError(f"{str(mjcf)!r} does not end in .xml; a file of MuJoCo does.")
-    if pieces is not None and not 4 <= pieces <= 200:
-        raise InputError(f"--pieces is {pieces}; give a whole number from 4 to 200.")
+    check_number("--pieces", pieces or 4, Bound(least=4, most=200), whole=True)
     written(its, pieces=pieces)  # refuses before anything is computed
     said = "static error not measured: MuJoCo is not installed"
     if find_spec("mujoco") is not None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.checks import Bound, check_number
 from fastrod.contact.engine import Engine, motion_of, unknown_clearance
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
@@ -173,8 +174,7 @@ def ray_cast(engine: Engine, origin: ArrayLike, direction: ArrayLike, longest: f
     length = np.linalg.norm(v, axis=-1, keepdims=True)
     if not (np.isfinite(o).all() and np.isfinite(v).all() and (length > 0.0).all()):
         raise InputError("a ray has an origin or direction that is not finite, or a direction of length 0.")
-    if not longest > 0.0:
-        raise InputError(f"longest is {longest!r} m; it must be positive.")
+    check_number("longest", longest, Bound(above=0.0, unit="m", infinite=True))
     shape = o.shape[:2]
     hits = Hits(np.full(shape, np.inf), np.full(shape, -1), np.full((*shape, 3), np.nan))
     cast_rays(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import checked_array, checked_pose
+from fastrod.checks import NOT_NEGATIVE, Bound, check, checked_array, checked_pose
 from fastrod.contact.geometry import Obstacle
-from fastrod.errors import InputError, UnknownNameError, nearest, shown
+from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.model.robot import Robot
 from fastrod.types import ContactRods, Floats, Ints, Layout
 
@@ -33,22 +33,22 @@ class ContactScene:
     rod_radius: float | Sequence[float] | None = None
     """Radius of the rods, one or one for each segment [m]; None: body_radius of the robot file, and where
     that is 0 just beyond the outermost tendon. The tip is a half sphere."""
-    mounting: float | None = None
+    mounting: Annotated[float | None, Bound(least=0.0, unit="m")] = None
     """Arclength from the base that belongs to the mounting and touches nothing [m]; None: 1.5 radii."""
     self_contact: bool = False
     """A rod touches itself too."""
     worlds: Sequence[int] | None = None
     """(n_robots,) number of the world that a robot is in; robots of one world touch each other. None: each
     has its own."""
-    rod_friction: float = 0.0
+    rod_friction: Annotated[float, NOT_NEGATIVE] = 0.0
     """Coulomb coefficient of rod on rod."""
-    rod_stiffness: float = math.inf
+    rod_stiffness: Annotated[float, Bound(above=0.0, unit="N/m", infinite=True)] = math.inf
     """Force per depth of rod on rod; inf is rigid [N/m]."""
-    max_contacts: int = 16
+    max_contacts: Annotated[int, Bound(least=1, most=64)] = 16
     """Contacts that a rod can have at once."""
-    watch: float = 0.01
+    watch: Annotated[float, Bound(above=0.0, most=0.2)] = 0.01
     """Gap below which a contact is watched before it closes, as a fraction of the rod's length."""
-    max_iterations: int = 600
+    max_iterations: Annotated[int, Bound(least=20)] = 600
     """Iterations after which a step that cannot be solved is given up: fewer where many robots wait for one,
     as in training."""
     collision: Literal["bvh", "fcl", "auto"] = "auto"
@@ -71,37 +71,8 @@ class ContactScene:
             raise InputError(
                 f"two obstacles are called {twice!r}; give each a name of its own, mesh(..., name='left')."
             )
-        if not (math.isfinite(self.rod_friction) and self.rod_friction >= 0.0):
-            raise InputError(
-                f"ContactScene.rod_friction is {self.rod_friction!r}; it must be zero or positive."
-            )
-        if not self.rod_stiffness > 0.0:
-            raise InputError(
-                f"ContactScene.rod_stiffness is {self.rod_stiffness!r} N/m; it must be "
-                "positive, or inf for rigid."
-            )
-        if not isinstance(self.max_contacts, int) or not 1 <= self.max_contacts <= 64:
-            raise InputError(
-                f"ContactScene.max_contacts is {self.max_contacts!r}; it must be a whole number from 1 to 64."
-            )
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 20:
-            raise InputError(
-                f"ContactScene.max_iterations is {self.max_iterations!r}; it must be a whole number, at "
-                "least 20."
-            )
-        if self.collision not in ("bvh", "fcl", "auto"):
-            raise InputError(
-                f"ContactScene.collision is {shown(self.collision)}; "
-                f"{nearest(str(self.collision), ('bvh', 'fcl', 'auto'))}"
-            )
+        check(self)
         object.__setattr__(self, "collision", "fcl" if self.collision == "fcl" else "bvh")
-        if not 0.0 < self.watch <= 0.2:
-            raise InputError(
-                f"ContactScene.watch is {self.watch!r}; it is a fraction of the rod's length, between 0 and "
-                "0.2."
-            )
-        if self.mounting is not None and not (math.isfinite(self.mounting) and self.mounting >= 0.0):
-            raise InputError(f"ContactScene.mounting is {self.mounting!r} m; it must be zero or positive.")
 
     @property
     def names(self) -> tuple[str, ...]:

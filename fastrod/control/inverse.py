@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import checked_array
+from fastrod.checks import COUNT, Bound, check_number, checked_array
 from fastrod.effects.base import Seam, get_effect
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError
@@ -107,13 +107,12 @@ def plan(
     """
     path = _path(target)
     for name, value, unit in (("rate", rate, "Hz"), ("gain", gain, ""), ("tolerance", tolerance, "m")):
-        _check_number(name, value, unit, zero=False)
+        check_number(name, value, Bound(above=0.0, unit=unit))
     for name, optional in (("limit", limit), ("rate_limit", rate_limit)):
         if optional is not None:
-            _check_number(name, optional, "m" if name == "limit" else "m/s", zero=False)
-    _check_number("approach", approach, "s", zero=True)
-    if isinstance(rollouts, bool) or not isinstance(rollouts, (int, np.integer)) or rollouts < 1:
-        raise InputError(f"rollouts is {rollouts!r}; it must be a whole number, at least 1.")
+            check_number(name, optional, Bound(above=0.0, unit="m" if name == "limit" else "m/s"))
+    check_number("approach", approach, Bound(least=0.0, unit="s"))
+    check_number("rollouts", rollouts, COUNT, whole=True)
     drive = _Drive(robot, limit)
     began = drive.coordinates(start)
     nearest, q, jacobian = _nearest(drive, path)
@@ -345,19 +344,6 @@ def _path(target: ArrayLike) -> Floats:
     if not np.isfinite(path).all():
         raise InputError("target holds a position that is not finite; give all of the path.")
     return path
-
-
-def _check_number(name: str, value: object, unit: str, *, zero: bool) -> None:
-    number = (
-        float(value)
-        if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool)
-        else np.nan
-    )
-    if not (np.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
-        raise InputError(
-            f"{name} is {value!r}{' ' if unit else ''}{unit}; it must be a finite number, "
-            f"{'zero or ' * zero}positive."
-        )
 
 
 def _check_speed(dl: Floats, rate: float, rate_limit: float) -> None:

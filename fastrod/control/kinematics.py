@@ -10,7 +10,7 @@ from typing import Any, Protocol, cast, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import checked_array, checked_pose
+from fastrod.checks import Bound, check_number, checked_array, checked_pose
 from fastrod.errors import InputError
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
@@ -204,12 +204,7 @@ class SoftTip:
         """Least and largest action (3 n_segments,) each [m]: each segment's range of extension, and
         displacements of both tendons that bend it by no more than `largest_bend` [rad]. Limits of the base
         stand before these in q. Raises `InputError`."""
-        if not isinstance(largest_bend, (int, float, np.floating)) or not (
-            math.isfinite(largest_bend) and largest_bend > 0.0
-        ):
-            raise InputError(
-                f"largest_bend is {largest_bend!r} rad; it must be a number, positive and finite."
-            )
+        check_number("largest_bend", largest_bend, Bound(above=0.0, unit="rad"))
         low, high = (np.empty((len(self.actions.offset), 3)) for _ in range(2))
         for k, segment in enumerate(self.actions.robot.segments):
             low[k, 0], high[k, 0] = segment.extension
@@ -223,8 +218,7 @@ class SoftTip:
         range, zero where there is no range. The simulator is left as it was. Raises `InputError`, also where
         an end does not settle."""
         q = self._read(q)
-        if not isinstance(step, (int, float, np.floating)) or not (math.isfinite(step) and step > 0.0):
-            raise InputError(f"step is {step!r}; it must be a number, positive and finite.")
+        check_number("step", step)
         before = self.simulator.snapshot()
         jacobian = np.zeros((3, self.n_q))
         low, high = np.full(self.n_q, -np.inf), np.full(self.n_q, np.inf)

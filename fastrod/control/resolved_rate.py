@@ -10,7 +10,7 @@ from typing import Annotated, cast, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import Bound, check
+from fastrod.checks import Bound, check, check_number
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 
@@ -139,8 +139,7 @@ class ResolvedRate:
             )
         if self._n_q is not None and len(q) != self._n_q:
             raise InputError(f"q has {len(q)} coordinates; this ResolvedRate is made for {self._n_q}.")
-        if not (_is_number(dt) and dt > 0.0):
-            raise InputError(f"dt is {dt!r} s; it must be a number, positive and finite.")
+        check_number("dt", dt, Bound(above=0.0, unit="s"))
         if not math.isfinite(q.sum() + J.sum() + error.sum() + feedforward.sum()):
             for name, a in (("q", q), ("jacobian", J), ("error", error), ("feedforward", feedforward)):
                 if not np.isfinite(a).all():
@@ -264,7 +263,3 @@ def scaled_rates(jacobian: Floats, velocity: Floats, wish: Floats) -> Floats:
     free = 0.2 * (wish - (inverse @ (jacobian @ wish[:, :, None]))[:, :, 0])
     rates = (inverse @ velocity[:, :, None])[:, :, 0] + free
     return np.asarray(rates / np.maximum(np.abs(rates).max(1, keepdims=True), 1.0))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.floating, np.integer)) and math.isfinite(value)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import HostError, InputError, nearest
 from fastrod.types import Floats
 
@@ -144,8 +145,7 @@ def connect(
     numbers.
     """
     module = pybullet()
-    if not isinstance(dt, (int, float)) or not 0.0 < dt < 1.0:
-        raise InputError(f"dt is {dt!r} s; it must be positive, usually 0.001 to 0.01.")
+    check_number("dt", dt, Bound(above=0.0, below=1.0, unit="s"))
     if np.shape(gravity) != (3,) or not np.isfinite(gravity).all():
         raise InputError(
             f"gravity is {gravity!r}; give three numbers, world [m/s^2], for example (0, 0, -9.81)."

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod.effects.base import effect_names, get_effect
 from fastrod.effects.executor import acts_on_commands, feels_tip
 from fastrod.effects.pipeline import named_effects
@@ -94,8 +95,7 @@ def identify(
     Deterministic, unless the search stops by time (`MOST_SECONDS`), as a note then says.
     Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
-    if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
-        raise InputError(f"max_effects is {max_effects!r}; it must be a whole number, 0 or more.")
+    check_number("max_effects", max_effects, NOT_NEGATIVE, whole=True)
     if network and dynamics:
         raise InputError("network=True is for a log at rest; leave it out with dynamics=True.")
     if only_session and dynamics:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import LogError
 from fastrod.logs.folder import make_folder
 from fastrod.logs.runlog import RunLog
@@ -29,8 +30,7 @@ def write_lerobot(log: RunLog, folder: str | Path, *, robot: str, fps: int, task
     `fps`. Rows that miss one are left out before. Raises `LogError` where nothing is left, where the folder
     holds something, or pyarrow is not installed.
     """
-    if not 1 <= fps <= 1000:
-        raise LogError(f"fps is {fps!r}; it must be a whole number from 1 to 1000.")
+    check_number("fps", fps, Bound(least=1, most=1000), whole=True, error=LogError)
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise LogError(f"{str(folder)!r} holds something already; give a new folder.")

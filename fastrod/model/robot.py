@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.checks import named_fields
-from fastrod.errors import RobotError, nearest, shown
+from fastrod.checks import Bound, check, check_number, named_fields
+from fastrod.errors import RobotError, shown
 from fastrod.model.logformat import LogFormat
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
@@ -24,30 +24,17 @@ _LONGEST = 10.0  # m; a longer segment was given in mm
 
 _Class = TypeVar("_Class")
 _SHORTEST = 1e-6  # m
-_STIFF = (1e-20, 1e15)  # N m^2
 _GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
 _MOST = 1e9
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-
-
-def _positive(where: str, value: float, unit: str, low: float = 0.0, high: float = math.inf) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise RobotError(f"{where} is {value!r} {unit}; it must be positive and finite.")
-    if not low <= value <= high:
-        raise RobotError(f"{where} is {value!r} {unit}; it must be between {low:g} and {high:g} {unit}.")
-
-
-def _finite(where: str, values: tuple[float, ...], count: int, unit: str) -> None:
-    if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise RobotError(f"{where} is {list(values)!r}; it must be {count} finite numbers [{unit}].")
-    if any(abs(v) > _MOST for v in values):
-        raise RobotError(
-            f"{where} is {list(values)!r}; its numbers must be between {-_MOST:g} and {_MOST:g} {unit}."
-        )
+_MM = "Was it given in mm?"
+_SIZE = Bound(least=_SHORTEST, most=_LONGEST, unit="m", hint=_MM)
+_ANGLE = Bound(least=-6.2832, most=6.2832, unit="rad", hint="Was it given in degrees?")
+_ANY = Bound(least=-_MOST, most=_MOST)
+_STIFF = Bound(least=1e-20, most=1e15, unit="N m^2")
+_CURVATURE = Bound(least=-_MOST, most=_MOST, unit="1/m")
+_INERTIA = Bound(least=0.0, most=_MOST, unit="kg m^2")
+_RADIUS = Bound(least=0.0, most=_LONGEST, unit="m", hint=_MM)
 
 
 def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -> tuple[float, ...]:
@@ -85,10 +72,10 @@ class Tendon:
     """Distance from the backbone [m]."""
     angle: float | tuple[float, ...]
     """Position around it, from d1 toward d2 [rad]."""
-    compliance: float = 1e-5
+    compliance: Annotated[float, Bound(least=0.0, most=_MOST, unit="m/N")] = 1e-5
     """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]. Below 1e-9 counts as 1e-9: three or
     more tendons that do not stretch at all lock the twist with tensions beyond bound."""
-    pretension: float = 0.0
+    pretension: Annotated[float, Bound(least=-_MOST, most=_MOST, unit="N")] = 0.0
     """Tension at which the tendon has its commanded length [N]."""
     unilateral: bool = False
     """True: a cable that goes slack at T = 0; False: a push-pull rod that carries T < 0 too."""
@@ -97,23 +84,14 @@ class Tendon:
         for name in ("offset", "angle"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
-        for offset in self.offset if isinstance(self.offset, tuple) else (self.offset,):
-            _positive("Tendon.offset", offset, "m", _SHORTEST, _LONGEST)
-        angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
-        _finite("Tendon.angle", angles, len(angles), "rad")
-        if any(abs(a) > 2.0 * math.pi + 1e-6 for a in angles):
+        for name, value, bound in (("offset", self.offset, _SIZE), ("angle", self.angle, _ANGLE)):
+            for one in value if isinstance(value, tuple) else (value,):
+                check_number(f"Tendon.{name}", one, bound, error=RobotError)
+        check(self, error=RobotError)
+        if self.unilateral and self.pretension < 0.0:
             raise RobotError(
-                f"Tendon.angle is {self.angle!r} rad; more than a turn. Was it given in degrees?"
-            )
-        if not 0.0 <= self.compliance <= _MOST:
-            raise RobotError(
-                f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, "
-                "for example 1e-5."
-            )
-        if not abs(self.pretension) <= _MOST or (self.unilateral and self.pretension < 0.0):
-            raise RobotError(
-                f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a "
-                "wire that can go slack."
+                f"Tendon.pretension is {self.pretension!r} N; of a wire that can go slack it must be zero or "
+                "positive."
             )
 
     def position(self, n_crossed: int) -> tuple[tuple[float, float], ...]:
@@ -128,28 +106,20 @@ class Tendon:
 class Lump:
     """A rigid mass on the backbone: a disk, a marker, a payload."""
 
-    at: float
+    at: Annotated[float, Bound(least=0.0, most=_LONGEST, unit="m")]
     """Arclength in its segment, without extension [m]."""
-    mass: float
+    mass: Annotated[float, Bound(least=0.0, most=_MOST, unit="kg")]
     """[kg]"""
-    inertia: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    inertia: Annotated[tuple[float, float, float], _INERTIA] = (0.0, 0.0, 0.0)
     """Moments of inertia about d1, d2, d3 through its centre, on the backbone [kg m^2]."""
 
     def __post_init__(self) -> None:
-        if not _number(self.at) or not 0.0 <= self.at <= _LONGEST:
-            raise RobotError(f"Lump.at is {self.at!r} m; it must lie on its segment, from 0 to its length.")
-        if not _number(self.mass) or not 0.0 <= self.mass <= _MOST:
-            raise RobotError(f"Lump.mass is {self.mass!r} kg; it must be zero or positive, and finite.")
-        if not isinstance(self.inertia, (tuple, list)) or not all(map(_number, self.inertia)):
-            raise RobotError(
-                f"Lump.inertia is {self.inertia!r}; give the three moments about d1, d2 and d3 [kg m^2]."
-            )
-        _finite("Lump.inertia", self.inertia, 3, "kg m^2")
+        check(self, error=RobotError)
         a, b, c = sorted(self.inertia)
-        if a < 0.0 or c > (a + b) * (1.0 + 1e-9):
+        if c > (a + b) * (1.0 + 1e-9):
             raise RobotError(
-                f"Lump.inertia is {list(self.inertia)!r} kg m^2; no body has it: each must be zero or "
-                "positive, and none larger than the other two together."
+                f"Lump.inertia is {list(self.inertia)!r} kg m^2; no body has it: none may be larger than the "
+                "other two together."
             )
 
 
@@ -158,29 +128,29 @@ class Lump:
 class Segment:
     """A length of backbone with one stiffness, and the tendons that end at its end."""
 
-    length: float
+    length: Annotated[float, _SIZE]
     """Backbone length without extension [m]."""
-    bending_stiffness: tuple[float, float]
+    bending_stiffness: Annotated[tuple[float, float], _STIFF]
     """EI about d1 and about d2 [N m^2]."""
-    torsional_stiffness: float
+    torsional_stiffness: Annotated[float, _STIFF]
     """GJ [N m^2]."""
-    extension: tuple[float, float] = (0.0, 0.0)
+    extension: Annotated[tuple[float, float], Bound(least=-_LONGEST, most=_LONGEST, unit="m")] = (0.0, 0.0)
     """Allowed change of length, smallest and largest [m]."""
-    precurvature: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    precurvature: Annotated[tuple[float, float, float], _CURVATURE] = (0.0, 0.0, 0.0)
     """u*, curvature without moment, material frame [1/m]."""
-    body_radius: float = 0.0
+    body_radius: Annotated[float, _RADIUS] = 0.0
     """Radius of the body, for contact and drawing [m]; 0 stands for just beyond the outermost tendon."""
-    gyration_radius: float = 0.0
+    gyration_radius: Annotated[float, _RADIUS] = 0.0
     """Radius of gyration of the cross-section about its diameters, for the inertia of its turns in motion
     [m]; 0 stands for half of `body_radius`, that of a solid round one."""
-    line_density: float = 0.0
+    line_density: Annotated[float, Bound(least=0.0, most=_MOST, unit="kg/m")] = 0.0
     """Mass per length [kg/m]; 0 is weightless."""
-    damping_time: float = 0.0
+    damping_time: Annotated[float, Bound(least=0.0, most=_MOST, unit="s")] = 0.0
     """Kelvin-Voigt damping [s]: the moment is EI (kappa + damping_time dkappa/dt), likewise torsion, shear
     and stretch. Felt in motion only."""
-    axial_stiffness: float = math.inf
+    axial_stiffness: Annotated[float, Bound(above=0.0, unit="N", infinite=True)] = math.inf
     """EA [N]; inf: the backbone does not stretch."""
-    shear_stiffness: float = math.inf
+    shear_stiffness: Annotated[float, Bound(above=0.0, unit="N", infinite=True)] = math.inf
     """GA times the shear coefficient [N]; inf: cross-sections stay normal to the backbone."""
     lumps: tuple[Lump, ...] = ()
     mode: Mode = "tendon_length"
@@ -208,17 +178,13 @@ class Segment:
         0.0
         """
         ends = tuple(radius) if isinstance(radius, (tuple, list)) else (radius,)
-        for name, value, unit in (
-            *(("radius", r, "m") for r in ends),
-            ("youngs_modulus", youngs_modulus, "Pa"),
+        for name, value, bound in (
+            *(("radius", r, _SIZE) for r in ends),
+            ("youngs_modulus", youngs_modulus, Bound(least=1.0, most=1e15, unit="Pa")),
+            ("density", density, Bound(least=0.0, most=_MOST, unit="kg/m^3")),
+            ("poisson", poisson, Bound(above=-1.0, most=0.5)),
         ):
-            if not _number(value):
-                raise RobotError(f"{name} is {value!r}; it must be a number [{unit}].")
-            _positive(name, value, unit, *((_SHORTEST, _LONGEST) if unit == "m" else (1.0, _STIFF[1])))
-        if not _number(density) or not 0.0 <= density <= _MOST:
-            raise RobotError(f"density is {density!r} kg/m^3; it must be zero or positive.")
-        if not _number(poisson) or not -1.0 < poisson <= 0.5:
-            raise RobotError(f"poisson is {poisson!r}; Poisson's ratio is above -1, and 0.5 at most.")
+            check_number(name, value, bound, error=RobotError)
         # forces and moments are the same along a short piece: what is averaged is how it gives to them
         area, second_moment = math.pi / _mean_power(ends, -2), 0.25 * math.pi / _mean_power(ends, -4)
         shear_modulus = 0.5 * youngs_modulus / (1.0 + poisson)
@@ -236,41 +202,13 @@ class Segment:
         return cls(**(given | more))
 
     def __post_init__(self) -> None:
-        _positive("Segment.length", self.length, "m")
-        if self.length > _LONGEST:
-            raise RobotError(
-                f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?"
-            )
-        _positive("Segment.length", self.length, "m", _SHORTEST)
-        if not isinstance(self.bending_stiffness, (tuple, list)) or len(self.bending_stiffness) != 2:
-            raise RobotError(
-                f"Segment.bending_stiffness is {self.bending_stiffness!r}; give two values, "
-                "EI_x and EI_y [N m^2]."
-            )
-        for value in self.bending_stiffness:
-            _positive("Segment.bending_stiffness", value, "N m^2", *_STIFF)
-        _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2", *_STIFF)
-        _finite("Segment.precurvature", self.precurvature, 3, "1/m")
-        _finite("Segment.extension", self.extension, 2, "m")
+        check(self, error=RobotError)
         low, high = self.extension
-        if not -self.length < low <= 0.0 <= high <= _LONGEST:
+        if not -self.length < low <= 0.0 <= high:
             raise RobotError(
                 f"Segment.extension is {list(self.extension)!r} m; "
                 f"give [smallest, largest] change of the {self.length:g} m length, around 0."
             )
-        if not 0.0 <= self.line_density <= _MOST:
-            raise RobotError(
-                f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive."
-            )
-        if not _number(self.damping_time) or not 0.0 <= self.damping_time <= _MOST:
-            raise RobotError(
-                f"Segment.damping_time is {self.damping_time!r} s; it must be zero or positive, and finite."
-            )
-        for name in ("axial_stiffness", "shear_stiffness"):
-            if not _number(getattr(self, name)) or not getattr(self, name) > 0.0:
-                raise RobotError(
-                    f"Segment.{name} is {getattr(self, name)!r} N; it must be positive, or left out (inf)."
-                )
         if not isinstance(self.lumps, (tuple, list)) or not all(isinstance(a, Lump) for a in self.lumps):
             raise RobotError(
                 f"Segment.lumps is {self.lumps!r}; give a tuple of Lump(at=..., mass=...), in m and kg."
@@ -281,18 +219,10 @@ class Segment:
                     f"Lump.at is {lump.at:g} m, beyond the {self.length:g} m of its segment; give its "
                     "arclength in the segment."
                 )
-        if self.mode not in MODES:
-            raise RobotError(f"Segment.mode is {self.mode!r}; {nearest(str(self.mode), MODES)}")
         if self.mode == "passive" and self.tendons:
             raise RobotError(f"A passive segment has no tendons; it was given {len(self.tendons)}.")
         if self.mode != "passive" and not self.tendons:
             raise RobotError(f"A segment in mode {self.mode!r} needs tendons; give some, or mode 'passive'.")
-        for name in ("body_radius", "gyration_radius"):
-            if not _number(getattr(self, name)) or not 0.0 <= getattr(self, name) <= _LONGEST:
-                raise RobotError(
-                    f"Segment.{name} is {getattr(self, name)!r} m; it must be between 0 and "
-                    f"{_LONGEST:g} m. Was it given in mm?"
-                )
 
 
 @named_fields(RobotError)
@@ -309,11 +239,11 @@ class Robot:
 
     name: str
     segments: tuple[Segment, ...]
-    base_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_position: Annotated[tuple[float, float, float], _ANY] = (0.0, 0.0, 0.0)
     """World frame [m]."""
-    base_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    base_quaternion: Annotated[tuple[float, float, float, float], _ANY] = (1.0, 0.0, 0.0, 0.0)
     """world_from_base, w x y z; d3 of the base is the rod's first tangent."""
-    gravity: tuple[float, float, float] = _GRAVITY
+    gravity: Annotated[tuple[float, float, float], _ANY] = _GRAVITY
     """World frame [m/s^2], of a robot that stands free. One that is mounted on a host feels the host's."""
     states_gravity: bool = False
     """The robot says itself which gravity it feels: a robot file with `[world] gravity`, or any other than
@@ -340,14 +270,12 @@ class Robot:
             raise RobotError(f"Robot.segments is {shown(self.segments)}; give a tuple of Segment(...).")
         if not self.segments:
             raise RobotError(f"Robot {self.name!r} has no segments; give at least one.")
-        _finite("Robot.base_position", self.base_position, 3, "m")
-        _finite("Robot.base_quaternion", self.base_quaternion, 4, "w x y z")
+        check(self, error=RobotError)
         if abs(math.hypot(*self.base_quaternion) - 1.0) > 1e-6:
             norm = math.hypot(*self.base_quaternion)
             raise RobotError(
                 f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1."
             )
-        _finite("Robot.gravity", self.gravity, 3, "m/s^2")
         if tuple(self.gravity) != _GRAVITY:
             object.__setattr__(self, "states_gravity", True)
         self._check_sensor()
@@ -385,7 +313,7 @@ class Robot:
                 "arclengths; give each point one pair [m]."
             )
         for pair in self.log_offsets:
-            _finite("[log] point_offsets", tuple(pair), 2, "m")
+            check_number("[log] point_offsets", pair, _ANY, count=2, error=RobotError)
 
     def _check_sensor(self) -> None:
         for key, value in self.sensor.items():

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.checks import checked_array
+from fastrod.checks import COUNT, Bound, check_number, checked_array
 from fastrod.errors import InputError, Problem, shown
 from fastrod.kernels.rod.modal.host import ModalHost
 from fastrod.kernels.rod.modal.motion import ModalMotion
@@ -91,13 +91,11 @@ class ModalRods:
             return
         if how.estimate_error and not self.dynamics:
             raise InputError("estimate_error is of steps in time; give Simulator(robot, dynamics=True).")
-        passes = how.passes
-        if not isinstance(passes, (int, np.integer)) or not 1 <= passes <= 100:
-            raise InputError(f"passes is {shown(passes)}; give a whole number from 1 to 100.")
+        check_number("passes", how.passes, Bound(least=1, most=100), whole=True)
         errors = np.full(self.n_robots, np.nan) if how.estimate_error else None
         host = None if how.inverse_inertia is None else self._freed(how.inverse_inertia, errors is not None)
         self._errors, self._host = errors, host
-        self.stepper.time = self.stepper.time._replace(passes=int(passes), dt=how.dt)
+        self.stepper.time = self.stepper.time._replace(passes=int(how.passes), dt=how.dt)
         self._mean[:] = mean_by_end(self.stepper.time)
 
     def _freed(self, inverse_inertia: ArrayLike, estimates: bool) -> ModalHost:
@@ -255,10 +253,9 @@ class ModalRods:
         stiffness[:, 3:, 3:] += 0.5 * np.cross(np.eye(3), state.base_wrench[:, None, 3:])
         return self._mean[:, None, None] * stiffness if mean else stiffness
 
-    def frequencies(self, count: object, acting: Acting, warm: Flags) -> Floats:
+    def frequencies(self, count: Any, acting: Acting, warm: Flags) -> Floats:
         """(n_robots, count) as `Simulator.frequencies`."""
-        if not isinstance(count, (int, np.integer)) or count < 1:
-            raise InputError(f"count is {shown(count)}; give a whole number, at least 1.")
+        check_number("count", count, COUNT, whole=True)
         if count > (most := self.modal.motion.q.shape[1]):
             raise InputError(f"count is {shown(count)}; these rods have {most} unknowns: give more modes.")
         return np.asarray(self.linear(acting, warm).frequencies(int(count)))

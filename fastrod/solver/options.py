@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 import numba
 import numpy as np
 
-from fastrod.checks import NOT_NEGATIVE, POSITIVE, Bound, check, check_number, named_fields
+from fastrod.checks import COUNT, NOT_NEGATIVE, POSITIVE, Bound, check, check_number, named_fields
 from fastrod.errors import InputError, RobotError, nearest, shown
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
@@ -92,8 +92,7 @@ def _check_modes(modes: object) -> None:
         raise InputError(f"modes is {shown(modes)}; give fastrod.Modes(bending=4, torsion=2), or None.")
     for name, value in modes._asdict().items():
         most = _MOST_PIECES if name == "pieces" else _MOST_MODES
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
-            raise InputError(f"modes has {name}={shown(value)}; give a whole number from 1 to {most}.")
+        check_number(f"modes.{name}", value, Bound(least=1, most=most), whole=True)
 
 
 _HEAVY = 30.0
@@ -124,7 +123,7 @@ def usual_modes(robots: Sequence[Robot], *, coarse: bool) -> Modes:
     return Modes(6, 4, pieces=min(max(1, math.ceil(0.5 * bends)), _MOST_PIECES))
 
 
-def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], int]:
+def checked_robots(robot: object, n_robots: Any) -> tuple[tuple[Robot, ...], int]:
     """The robots, one for all or one each, and their number. Raises `RobotError`, `InputError`."""
     robots = (
         (robot,) if isinstance(robot, Robot) else tuple(robot) if isinstance(robot, (list, tuple)) else ()
@@ -135,8 +134,7 @@ def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], 
             "fastrod.load_robot('prototype'), or a list of them."
         )
     n = len(robots) if n_robots is None else n_robots
-    if not isinstance(n, (int, np.integer)) or n < 1:
-        raise InputError(f"n_robots is {n!r}; it must be a whole number, at least 1.")
+    check_number("n_robots", n, COUNT, whole=True)
     if len(robots) not in (1, n):
         raise InputError(f"{len(robots)} robots for n_robots {n}; give one for all, or a list of n_robots.")
     return robots, int(n)
@@ -144,23 +142,19 @@ def checked_robots(robot: object, n_robots: object) -> tuple[tuple[Robot, ...], 
 
 def check_options(points_per_segment: object, dt: object, outputs: object) -> None:
     """Raise `InputError` for an option of `Simulator` that cannot be."""
-    if not isinstance(points_per_segment, (int, np.integer)) or points_per_segment < 2:
-        raise InputError(
-            f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2."
-        )
+    check_number("points_per_segment", points_per_segment, Bound(least=2), whole=True)
     check_number("dt", dt, Bound(above=0.0, unit="s"))
     if outputs not in ("full", "tip"):
         raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
 
 
-def checked_threads(threads: object) -> int:
+def checked_threads(threads: Any) -> int:
     """The number of threads; None is numba's. Raises `InputError`."""
     most = int(_config.NUMBA_NUM_THREADS)
     if threads is None:
         return int(numba.get_num_threads())
-    if not isinstance(threads, int) or not 1 <= threads <= most:
-        raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {most} here.")
-    return threads
+    check_number("threads", threads, Bound(least=1, most=most), whole=True)
+    return int(threads)
 
 
 def solver_of(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod.errors import InputError, refuse_masked
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.task import Outcome, Task, bounds
@@ -46,10 +47,7 @@ class Streams:
                 f"{len(seeds)} seeds for {self._n} environments; give one number, or one for each."
             )
         for seed in seeds:
-            if seed is not None and (
-                isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0
-            ):
-                raise InputError(f"seed is {seed!r}; it must be a whole number, zero or positive.")
+            check_number("seed", 0 if seed is None else seed, NOT_NEGATIVE, whole=True)
         for i, seed in enumerate(seeds):
             if seed is not None:
                 self._generators[i] = np.random.default_rng(int(seed))

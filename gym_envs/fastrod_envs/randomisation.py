@@ -7,10 +7,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from fastrod.checks import Bound, check
 from fastrod.effects.base import canonical_name, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, nearest
@@ -36,7 +37,7 @@ class Randomisation:
     robot: Robot | None = None
     """Stands for the task's robot: an identified one with its effects. Its segments and tendons are those of
     the task's."""
-    spread: float = 0.0
+    spread: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0
     """Every number of the robot's own effects is drawn from (1 - spread, 1 + spread) of its value, within
     what it can be."""
     parameters: Mapping[str, Range] = field(default_factory=dict)
@@ -46,15 +47,12 @@ class Randomisation:
     """`backlash.half_width`: the range of an effect's parameter, in its unit. What a robot file says of it is
     replaced."""
 
-    absent: float = 0.0
+    absent: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0
     """Chance that an effect of `effects` is not there, its parameter neutral, each on its own: so that a
     policy meets plain robots too."""
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.absent, (int, float)) and 0.0 <= self.absent < 1.0):
-            raise InputError(f"absent is {self.absent!r}; it must be a number from 0 to below 1.")
-        if not (isinstance(self.spread, (int, float)) and 0.0 <= self.spread < 1.0):
-            raise InputError(f"spread is {self.spread!r}; it must be a number from 0 to below 1.")
+        check(self)
         for name in self.parameters:
             if name not in _FACTORS:
                 raise InputError(f"no parameter {name!r} to randomise; {nearest(name, _FACTORS)}")

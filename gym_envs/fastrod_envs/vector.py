@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from fastrod.checks import COUNT, check_number
 from fastrod.errors import InputError, nearest
 from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats
@@ -68,8 +69,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         """`task` is the name in the id, `FILE.py:Class`, or a task's class; `options` are those of
         the task (`Options`), `max_episode_steps` is another name of n_steps. Raises `InputError`,
         `UnknownNameError`, `HostError`."""
-        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
+        check_number("num_envs", num_envs, COUNT, whole=True)
         if autoreset not in _AUTORESET:
             raise InputError(f"autoreset is {autoreset!r}; {nearest(str(autoreset), _AUTORESET)}")
         self.metadata = {**self.metadata, "autoreset_mode": _AUTORESET[autoreset]}  # type: ignore[misc]

@@ -97,7 +97,7 @@ ALONE = {
     "negative rate": (lambda: drive_bus(-100.0), MS),
     "nan for a rate": (lambda: drive_bus(NAN), MS),
     "rate of 1/2 ms": (lambda: drive_bus(2000.0), MS),
-    "pacer": (lambda: Pacer(SteppedClock(), 0.0), "must be positive"),
+    "pacer": (lambda: Pacer(SteppedClock(), 0.0), "a number, positive"),
     "interface": (lambda: open_bus("virtul:a"), "did you mean 'virtual'", DeviceError),
     "no channel": (lambda: open_bus("virtual"), "lacks its channel", DeviceError),
     "no such bus": (lambda: open_bus("socketcan:no-such-can"), "cannot be opened", DeviceError),

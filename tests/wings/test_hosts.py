@@ -277,7 +277,7 @@ BAD_INPUT = {
     r"3 capsules for 10 points of a segment; give a divisor of the points\.": mounted(capsules_per_segment=3),
     r"friction is -1; it must be a number, zero or positive and finite\.": mounted(friction=-1),
     r"^gravity is 9.81; give three numbers": lambda w: connect(gravity=9.81),
-    r"^dt is 0 s; it must be positive": lambda w: connect(dt=0),
+    r"^dt is 0 s; it must be a number between 0 and 1 s": lambda w: connect(dt=0),
 }
 
 

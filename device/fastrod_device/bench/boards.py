@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol, final
 
 import numpy as np
 
-from fastrod.errors import InputError
+from fastrod.checks import COUNT, check_number
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_device.can.clock import Clock
@@ -219,8 +219,7 @@ def collect(
     It ends earlier where none could be taken for `patience` [s]. Raises `CalibrationError` where there is
     then none at all, `InputError` for a number of pictures that is none, and what the source raises.
     """
-    if isinstance(n, bool) or not isinstance(n, int) or n < 1:
-        raise InputError(f"{n!r} pictures of the board are asked for; it must be a whole number from 1.")
+    check_number("number of pictures", n, COUNT, whole=True)
     finder, report = BoardFinder(board), progress or (lambda *_: None)
     pictures: list[Picture] = []
     quads: list[Floats] = []

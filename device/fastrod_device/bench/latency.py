@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError
 from fastrod.model.routing import route
 from fastrod.types import Floats
@@ -64,8 +65,7 @@ def estimate_latency(
             f"t_motion, motion, t_camera and position have shapes {shapes}; (m,), (m, k), (n,) "
             "and (n, 3) would be right."
         )
-    if not longest > 0.0:
-        raise InputError(f"longest is {longest!r} s; it must be positive.")
+    check_number("longest", longest, Bound(above=0.0, unit="s", infinite=True))
     good = np.isfinite(t_motion) & np.isfinite(motion).all(1)
     t_motion, motion = t_motion[good], motion[good]
     if t_motion.size < 2 or (np.diff(t_motion) <= 0.0).any():

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fastrod.errors import InputError
+from fastrod.checks import NOT_NEGATIVE, check_number
 from fastrod_device.bench.boards import BoardEye, BoardMover, BoardPrompts, bent, moved
 from fastrod_device.bench.experiment import BenchAssistant, BenchPrompts
 from fastrod_device.can.clock import Clock, SteppedClock, WallClock
@@ -112,8 +112,7 @@ def emulated_board(
     nobody knows). Raises `InputError` for a seed that is none."""
     clock: Clock = SteppedClock() if stepped else WallClock()
     drawn = secrets.randbits(63) if seed is None else seed
-    if drawn < 0:
-        raise InputError(f"seed is {seed!r}; it must be a whole number from 0.")
+    check_number("seed", drawn, NOT_NEGATIVE, whole=True)
     truth = bent(camera, drawn) if lens else moved(camera, drawn)
     eye = BoardEye(truth, board, clock=clock, seed=drawn)
     yield BoardBench(source=eye, assistant=eye, clock=clock, truth=truth)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import math
 import os
 import sys
 import time
@@ -13,7 +12,7 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import final
 
-from fastrod.errors import InputError
+from fastrod.checks import Bound, check_number
 from fastrod_device.can.clock import Clock
 
 _SPIN = 3e-4  # s before the moment that are waited awake: a sleeping thread is woken some 0.1 ms late
@@ -69,8 +68,7 @@ class Pacer:
 
     def __init__(self, clock: Clock, rate: float) -> None:
         """`rate` [1/s], positive; `InputError` otherwise."""
-        if not (math.isfinite(rate) and rate > 0.0):
-            raise InputError(f"Pacer's rate is {rate!r} 1/s; it must be positive.")
+        check_number("Pacer.rate", rate, Bound(above=0.0, unit="1/s"))
         self._clock = clock
         self.period = 1.0 / rate
         """[s]."""

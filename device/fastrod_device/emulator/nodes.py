@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, final
 import numpy as np
 import numpy.typing as npt
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_device.can.bus import BusLine, guest
@@ -140,8 +141,7 @@ class EmulatedDrives:
 
         Raises `InputError` for drives that cannot be and for the file, `DeviceError` for the bus.
         """
-        if not (np.isfinite(rate) and rate > 0.0):
-            raise InputError(f"EmulatedDrives.rate is {rate!r} 1/s; it must be positive.")
+        check_number("EmulatedDrives.rate", rate, Bound(above=0.0, unit="1/s"))
         self._transmission = Transmission(specs)
         self._clock, self._tendons = clock, tendons
         self._rng, self._noise = np.random.default_rng(seed), torque_noise

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from fastrod.checks import Bound, check_number
 from fastrod.errors import InputError
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
@@ -122,8 +123,7 @@ class MarkerTracker:
         `InputError`.
         """
         for name, value in (("gate", gate), ("slack", slack), ("limit", limit), ("sigma", sigma)):
-            if not value > 0.0:
-                raise InputError(f"{name} is {value!r}; it must be positive.")
+            check_number(name, value, Bound(above=0.0, infinite=True))
         self.camera, self.marker = camera, marker
         self._matrix, self._base_from_camera = camera.intrinsics, camera.base_from_camera
         self._workspace, self._gate, self._slack = workspace, gate, slack

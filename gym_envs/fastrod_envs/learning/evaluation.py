@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fastrod.errors import InputError
+from fastrod.checks import COUNT, check_number
 from fastrod.types import Flags, Floats
 from fastrod_envs.learning.policies import Policy
 from fastrod_envs.registration import name_of, task_class
@@ -81,8 +81,7 @@ def evaluate(
     baseline) did in these very episodes: what is left when it does not look. Still does not move at all.
     Raises `InputError`, `UnknownNameError`.
     """
-    if not isinstance(episodes, int) or episodes < 1:
-        raise InputError(f"episodes is {episodes!r}; it must be a whole number, at least 1.")
+    check_number("episodes", episodes, COUNT, whole=True)
     kind, wanted = task_class(env), {**({} if policy is None else policy.options), **(options or {})}
     n = min(episodes, _MOST_HOSTED if kind.hosted else _MOST)
     batch = BatchEnv(name_of(env), num_envs=n, **wanted)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypedDict
 
 import msgspec
 
-from fastrod.checks import Bound, check
+from fastrod.checks import COUNT, Bound, check, check_number
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.reading import reading
 from fastrod_envs.learning.actor import actor_of
@@ -87,8 +87,7 @@ def make_plan(
 
     preset = preset_of(env)
     # before rollouts are divided among them
-    if n_envs is not None and (not isinstance(n_envs, int) or n_envs < 1):
-        raise InputError(f"n_envs is {n_envs!r}; it must be a whole number, at least 1.")
+    check_number("n_envs", 1 if n_envs is None else n_envs, COUNT, whole=True)
     kind = task_class(env)
     chosen = algorithm or preset.algorithm
     own = dict(preset.settings) if chosen == preset.algorithm else {}
