@@ -61,6 +61,7 @@ _WORTH_SAYING = 0.03
 _NUMBERS_OF_TENDONS = {"compliance", "pretension", "axial_stiffness"}
 _RETURNS = 2.8  # of the noise: a command that comes back farther off does so by more than the noise
 _FAST = 0.2  # of the residual's square, above the commands' band
+_LAG = "second_order_lag"
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
@@ -241,7 +242,9 @@ def assemble(
     said += _sign_of(base.without) if base.without else []
     said += _stand_ins(kept, final)
     said += _within_a_row(kept, final, samples.step)
-    said += _sentences(limits(robot, samples)) if say_limits else []
+    said += _sentences(shears(robot)) if say_limits else []
+    # a lag of second order rings, too
+    said += _sentences(rings(robot, samples)) if say_limits or (at_rest and _LAG in kept) else []
     fast, band = faster_than_commands(samples, np.asarray(samples.log.tip_position) - after)
     if say_limits and fast > _FAST:
         said.append(
@@ -653,27 +656,31 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
     return [*stages, *(stage(name, explained.state) for name in explained.names[-1:])]
 
 
-def limits(robot: Robot, samples: LogSamples) -> list[str]:
-    """Return what to try where this robot is thick or slow enough for shear or inertia and its file leaves
-    them out."""
-    found = []
+def shears(robot: Robot) -> list[str]:
+    """Return what to try where this robot is thick enough for shear and its file leaves that out."""
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
-    sheared = any(math.isfinite(s.shear_stiffness) for s in robot.segments)
-    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING and not sheared:
-        found.append(
-            f"shear may be {100 * fraction:.0f} % of the deflection of a body {0.5 / thickest:.1f} times as "
-            "long as thick: give its segments a shear_stiffness, and a [fit] of it"
-        )
-    mass = sum(s.line_density * s.length for s in robot.segments)
-    if mass > 0.0:
-        soft = min(min(s.bending_stiffness) for s in robot.segments)
-        frequency = 0.56 * math.sqrt(soft / (mass * robot.length**3))
-        if frequency < _SLOW and samples.step and 2.0 * frequency * samples.step < 1.0:
-            found.append(
-                f"it rings near {frequency:.1f} Hz, which a model at rest cannot follow: identify it in "
-                "motion, with --dynamics"
-            )
-    return found
+    fraction = 0.0 if any(math.isfinite(s.shear_stiffness) for s in robot.segments) else _SHEAR * thickest**2
+    return [
+        f"shear may be {100 * fraction:.0f} % of the deflection of a body {0.5 / thickest:.1f} times as "
+        "long as thick: give its segments a shear_stiffness, and a [fit] of it"
+    ] * (fraction > _WORTH_SAYING)
+
+
+def rings(robot: Robot, samples: LogSamples) -> list[str]:
+    """Return what to try where this robot is heavy enough to ring as slowly as the log can show."""
+    mass, base = 0.0, 0.0  # of an even rod that rings as slowly (Rayleigh, a cantilever bent at its end)
+    for segment in robot.segments:
+        mass += segment.line_density * segment.length
+        for lump in segment.lumps:
+            x = (base + lump.at) / robot.length
+            mass += 140.0 / 33.0 * lump.mass * (0.5 * x**2 * (3.0 - x)) ** 2
+        base += segment.length
+    soft = min(min(s.bending_stiffness) for s in robot.segments)
+    frequency = 0.56 * math.sqrt(soft / (max(mass, 1e-300) * robot.length**3))
+    return [
+        f"the robot rings near {frequency:.1f} Hz, which a model at rest cannot follow: identify it "
+        "in motion, with --dynamics"
+    ] * bool(frequency < _SLOW and samples.step and 2.0 * frequency * samples.step < 1.0)
 
 
 def _sentences(lines: Sequence[str]) -> list[str]:
