@@ -80,10 +80,6 @@ def module_of(file: Path) -> str:
     return ".".join(parts if parts[0] == "fastrod" else parts[1:])
 
 
-ROD: dict[str, Any] = {"length": 0.1, "bending_stiffness": (1.0, 1.0), "torsional_stiffness": 1.0}
-ROD["mode"] = "passive"
-
-
 def beyond(declared: Declared) -> list[Any]:
     """Return values that are none of these."""
     if declared.numbers:
@@ -99,13 +95,9 @@ def beyond(declared: Declared) -> list[Any]:
     return wrong if declared.optional else [*wrong, None]
 
 
-NAMED = Robot(name="one", segments=(Segment(**ROD),))
-LACKING: dict[type, Any] = {
-    Lump: Lump(at=0.0, mass=0.0),
-    Tendon: Tendon(offset=0.01, angle=0.0),
-    Segment: NAMED.segments[0],
-    Robot: NAMED,
-}
+ROD = Segment(length=0.1, bending_stiffness=(1.0, 1.0), torsional_stiffness=1.0, mode="passive")
+NAMED = Lump(at=0.0, mass=0.0), Tendon(offset=0.01, angle=0.0), ROD, Robot(name="one", segments=(ROD,))
+LACKING: dict[type, Any] = {type(one): one for one in NAMED}
 DECLARING = [cls for cls in declaring() if cls in LACKING or all(hasattr(cls, f.name) for f in fields(cls))]
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Quadruple: TypeAlias = tuple[float, float, float, float]
 
-_LARGEST = 10.0  # m; a larger obstacle was given in mm
+_LARGEST = 10.0  # m; a larger obstacle was given in mm, unless who gives it says `widest`
 _FARTHEST = 1e6  # m; of any vertex, used or not: beyond it squares and products leave what a float can hold
 _SMALLEST = 1e-4  # m; a smaller one was scaled twice
 # height of a face over its longest edge; a float32 file cannot say which way a flatter one points
@@ -57,11 +57,11 @@ def _number(where: str, value: object, unit: str) -> float:
         raise InputError(f"{where} is {value!r}; it must be a number [{unit}].") from None
 
 
-def _check_extent(where: str, extent: float, remedy: str) -> None:
-    if extent > _LARGEST:
+def _check_extent(where: str, extent: float, widest: float, remedy: str) -> None:
+    if not extent <= widest:
         raise InputError(
-            f"{where} is {extent:.6g} m wide; more than {_LARGEST:g} m. Was it given in mm? "
-            f"{remedy}=0.001 fixes that."
+            f"{where} is {extent:.6g} m wide; more than {widest:g} m. Was it given in mm? "
+            f"{remedy}=0.001 fixes that. If it is so large, widest={math.ceil(extent)} lets it be."
         )
     if extent < _SMALLEST:
         raise InputError(
@@ -108,8 +108,6 @@ class Obstacle:
         if any(v <= 0.0 for v in size[:used]) or any(size[used:]):
             need = f"{used} positive and {3 - used} zero" if used < 3 else "3 positive"
             raise InputError(f"size of {where} is {list(size)!r} m; a {self.shape} needs {need} numbers.")
-        if primitive is not None and used:
-            _check_extent(where, primitive.width(size), "a factor")
         vertices, faces = _arrays(where, self.vertices, self.faces)
         if (self.shape == "mesh") != (len(faces) > 0):
             raise InputError(
@@ -164,13 +162,17 @@ class Placement(TypedDict, total=False):
     quaternion: Sequence[float]
     friction: float
     stiffness: float
+    widest: float
+    """[m], beyond which lengths are taken for millimetres."""
 
 
 def obstacle(shape: str, size: Sequence[float] = (), **given: Unpack[Placement]) -> Obstacle:
     """A simple shape by its name (`Primitive.name`), with the lengths that it has [m]; `Obstacle` says what
     the options are, and what raises `InputError`."""
-    n_sizes = primitive_of(shape).n_sizes
+    primitive = primitive_of(shape)
+    n_sizes = primitive.n_sizes
     options: dict[str, Any] = {
+        "widest": _LARGEST,
         "position": (0.0, 0.0, 0.0),
         "quaternion": (1.0, 0.0, 0.0, 0.0),
         "friction": 0.0,
@@ -185,7 +187,11 @@ def obstacle(shape: str, size: Sequence[float] = (), **given: Unpack[Placement])
     full = finite_numbers(f"size of {shape} {options['name']!r}", size, n_sizes, "m") + (0.0,) * (3 - n_sizes)
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     fields: dict[str, Any] = {"size": full, "vertices": none, "faces": nothing, "closed": True}
-    return Obstacle(shape=shape, **fields, **options)
+    widest = options.pop("widest")
+    made = Obstacle(shape=shape, **fields, **options)
+    if n_sizes:
+        _check_extent(f"{shape} {made.name!r}", primitive.width(made.size), widest, "a factor")
+    return made
 
 
 def mesh(
@@ -199,6 +205,7 @@ def mesh(
     stiffness: float = math.inf,
     open_surface: bool = False,
     limits: MeshLimits | None = None,
+    widest: float = _LARGEST,
 ) -> Obstacle:
     """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched), or
     (vertices, faces).
@@ -208,7 +215,7 @@ def mesh(
     counter-clockwise seen from outside; an inverted body inside another is a cavity. `open_surface` takes a
     surface with open edges, or a closed one that faces inwards, as one-sided: the solid lies behind its
     normals. `limits`, by default those of `MeshLimits()`, are what reading a file may cost; materials and
-    whatever else a file refers to are not opened.
+    whatever else a file refers to are not opened. A mesh beyond `widest` [m] is taken for one in millimetres.
 
     Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong
     scale or beyond `limits`.
@@ -235,7 +242,7 @@ def mesh(
             f"{where} is empty: it has {len(triangles)} faces and none with an area; give a "
             "surface of triangles."
         )
-    _check_extent(where, float(np.ptp(vertices, axis=0).max()), "scale")
+    _check_extent(where, float(np.ptp(vertices, axis=0).max()), widest, "scale")
     closed = _check_surface(where, vertices, faces, open_surface)
     pose: dict[str, Any] = {"position": position, "quaternion": quaternion}  # `Obstacle` checks them
     return Obstacle(

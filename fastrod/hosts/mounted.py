@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
 
 from fastrod.checks import NOT_NEGATIVE, check_number
-from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.contact import Obstacle, mesh, obstacle, plane
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.body_contact import BodyContact, CollisionShape
@@ -56,14 +57,14 @@ def _shapes(bullet: Bullet, body: int, link: int) -> list[CollisionShape]:
         bullet.getCollisionShapeData(body, link)
     ):
         name = f"{label} {body}" + (f" link {link}" if link >= 0 else "") + (f" shape {i}" if i else "")
-        if kind == bullet.GEOM_BOX:
-            made = box(size, name=name)
-        elif kind == bullet.GEOM_SPHERE:
-            made = sphere(size[0], name=name)
-        elif kind == bullet.GEOM_CYLINDER:
-            made = cylinder(size[1], size[0], name=name)
-        elif kind == bullet.GEOM_CAPSULE:
-            made = capsule(size[1], size[0], name=name)
+        simple = {
+            bullet.GEOM_BOX: ("box", size),
+            bullet.GEOM_SPHERE: ("sphere", size[:1]),
+            bullet.GEOM_CYLINDER: ("cylinder", size[1::-1]),
+            bullet.GEOM_CAPSULE: ("capsule", size[1::-1]),
+        }
+        if kind in simple:
+            made = obstacle(*simple[kind], name=name, widest=math.inf)
         elif kind == bullet.GEOM_PLANE:
             made = plane(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), name=name)
         elif kind == bullet.GEOM_MESH:
@@ -82,7 +83,7 @@ def _hull(bullet: Bullet, body: int, link: int, name: str) -> Obstacle:
     import trimesh
 
     _, vertices = bullet.getMeshData(body, link, flags=bullet.MESH_DATA_SIMULATION_MESH)
-    return mesh(trimesh.convex.convex_hull(np.asarray(vertices, float)), name=name)
+    return mesh(trimesh.convex.convex_hull(np.asarray(vertices, float)), name=name, widest=math.inf)
 
 
 @final

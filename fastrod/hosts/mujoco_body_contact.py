@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
 
-from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.contact import Obstacle, mesh, obstacle, plane
 from fastrod.errors import HostError
 from fastrod.hosts.body_contact import BodyContact, CollisionShape
 from fastrod.hosts.host import Motion
@@ -72,20 +73,21 @@ def obstacle_of(model: Any, geom: int, name: str) -> Obstacle:
     """A geom as an obstacle, in its own frame. Raises `HostError` for height fields and other shapes that a
     rod cannot touch."""
     kinds = mujoco().mjtGeom
-    kind, (a, b, c) = model.geom_type[geom], model.geom_size[geom].tolist()
-    if kind == kinds.mjGEOM_BOX:
-        return box((2.0 * a, 2.0 * b, 2.0 * c), name=name)
-    if kind == kinds.mjGEOM_SPHERE:
-        return sphere(a, name=name)
-    if kind == kinds.mjGEOM_CYLINDER:
-        return cylinder(a, 2.0 * b, name=name)
-    if kind == kinds.mjGEOM_CAPSULE:
-        return capsule(a, 2.0 * b, name=name)
+    kind, (a, b, c) = kinds(int(model.geom_type[geom])), model.geom_size[geom].tolist()
+    simple = {
+        kinds.mjGEOM_BOX: ("box", (2.0 * a, 2.0 * b, 2.0 * c)),
+        kinds.mjGEOM_SPHERE: ("sphere", (a,)),
+        kinds.mjGEOM_CYLINDER: ("cylinder", (a, 2.0 * b)),
+        kinds.mjGEOM_CAPSULE: ("capsule", (a, 2.0 * b)),
+        kinds.mjGEOM_ELLIPSOID: ("ellipsoid", (a, b, c)),
+    }
+    if kind in simple:
+        return obstacle(*simple[kind], name=name, widest=math.inf)
     if kind == kinds.mjGEOM_PLANE:
         return plane(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), name=name)
     if kind == kinds.mjGEOM_MESH:
         return _hull(model, int(model.geom_dataid[geom]), name)
-    word = str(kinds(int(kind))).rsplit("_", 1)[-1].lower()
+    word = str(kind).rsplit("_", 1)[-1].lower()
     raise HostError(
         f"geom {geom} of {name!r} is of the kind {word}, which a rod cannot touch; give it a "
         "mesh, or a simple shape."
@@ -97,4 +99,5 @@ def _hull(model: Any, number: int, name: str) -> Obstacle:
     import trimesh
 
     first, n = model.mesh_vertadr[number], model.mesh_vertnum[number]
-    return mesh(trimesh.convex.convex_hull(np.asarray(model.mesh_vert[first : first + n], float)), name=name)
+    hull = trimesh.convex.convex_hull(np.asarray(model.mesh_vert[first : first + n], float))
+    return mesh(hull, name=name, widest=math.inf)

@@ -135,6 +135,7 @@ def test_every_geom_is_an_obstacle_where_it_is():
         "sphere": (kinds.mjGEOM_SPHERE, [0.03, 0, 0]),
         "cylinder": (kinds.mjGEOM_CYLINDER, [0.02, 0.025, 0]),
         "capsule": (kinds.mjGEOM_CAPSULE, [0.02, 0.025, 0]),
+        "ellipsoid": (kinds.mjGEOM_ELLIPSOID, [0.02, 0.01, 0.03]),
         "mesh": (kinds.mjGEOM_MESH, [0, 0, 0]),
     }
     for name, (kind, size) in shapes.items():
@@ -282,7 +283,6 @@ def test_capsules_that_no_model_can_have_are_a_sentence(error, sentence, call):
 
 
 GHOST = '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
-EGG = '<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>'
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +305,11 @@ def mounted(**options):
 
 def felt(inside, body):
     """Bodies of a model that a rod may touch."""
-    model = spec_of(inside).compile()
+    spec = spec_of(inside)
+    spec.add_hfield(name="hill", nrow=2, ncol=2, size=[1, 1, 1, 1], userdata=[0, 0, 0, 1])
+    hill = spec.worldbody.add_body(name="hill")
+    hill.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hill")
+    model = spec.compile()
     data, number = mujoco.MjData(model), model.body(body).id
     MujocoBodyContact(model, data, number, dt=0.005, friction=0.3)
 
@@ -338,7 +342,7 @@ NOT_THERE = {
     ),
     r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$": mounted(model="model"),
     r"^body 'ghost' has no geom that collides, so nothing can touch it\.$": lambda *_: felt(GHOST, "ghost"),
-    r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch": lambda *_: felt(EGG, "egg"),
+    r"^geom 0 of 'hill' is of the kind hfield, which a rod cannot touch": lambda *_: felt("", "hill"),
 }
 BAD_INPUT = {"^the mount has a quaternion of norm 1.41421; it must be 1": mounted(quaternion=(1, 1, 0, 0))}
 NO_ROBOT = {r"^robot is 'prototype'; give one Robot": mounted(robot="prototype")}

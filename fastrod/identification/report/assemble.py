@@ -659,11 +659,13 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
 def shears(robot: Robot) -> list[str]:
     """Return what to try where this robot is thick enough for shear and its file leaves that out."""
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
-    fraction = 0.0 if any(math.isfinite(s.shear_stiffness) for s in robot.segments) else _SHEAR * thickest**2
+    sheared = any(math.isfinite(s.shear_stiffness) for s in robot.segments)
+    if sheared or (fraction := _SHEAR * thickest**2) <= _WORTH_SAYING:
+        return []
     return [
         f"shear may be {100 * fraction:.0f} % of the deflection of a body {0.5 / thickest:.1f} times as "
         "long as thick: give its segments a shear_stiffness, and a [fit] of it"
-    ] * (fraction > _WORTH_SAYING)
+    ]
 
 
 def rings(robot: Robot, samples: LogSamples) -> list[str]:
@@ -676,11 +678,13 @@ def rings(robot: Robot, samples: LogSamples) -> list[str]:
             mass += 140.0 / 33.0 * lump.mass * (0.5 * x**2 * (3.0 - x)) ** 2
         base += segment.length
     soft = min(min(s.bending_stiffness) for s in robot.segments)
-    frequency = 0.56 * math.sqrt(soft / (max(mass, 1e-300) * robot.length**3))
+    frequency = 0.56 * math.sqrt(soft / robot.length**3 / mass) if mass > 0.0 else math.inf
+    if frequency >= _SLOW or not samples.step or 2.0 * frequency * samples.step >= 1.0:
+        return []
     return [
         f"the robot rings near {frequency:.1f} Hz, which a model at rest cannot follow: identify it "
         "in motion, with --dynamics"
-    ] * bool(frequency < _SLOW and samples.step and 2.0 * frequency * samples.step < 1.0)
+    ]
 
 
 def _sentences(lines: Sequence[str]) -> list[str]:
