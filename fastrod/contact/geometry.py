@@ -61,7 +61,7 @@ def _check_extent(where: str, extent: float, widest: float, remedy: str) -> None
     if not extent <= widest:
         raise InputError(
             f"{where} is {extent:.6g} m wide; more than {widest:g} m. Was it given in mm? "
-            f"{remedy}=0.001 fixes that. If it is so large, widest={math.ceil(extent)} lets it be."
+            f"{remedy}=0.001 fixes that. If it is so large, widest={1.01 * extent:.3g} lets it be."
         )
     if extent < _SMALLEST:
         raise InputError(

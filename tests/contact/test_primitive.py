@@ -201,9 +201,9 @@ def test_what_is_no_record_is_refused(emptied):
         obstacle("elipsoid", (1.0, 1.0, 1.0))
     with pytest.raises(InputError, match="must be 3 finite numbers"):
         ellipsoid((0.1, 0.1))
-    with pytest.raises(InputError, match=r"20 m wide; more than 10 m.* If it is so large, widest=20 lets"):
+    with pytest.raises(InputError, match=r"20 m wide; more than 10 m.* If it is so large, widest=20.2 lets"):
         ellipsoid((0.1, 10.0, 0.1))
-    assert ellipsoid((0.1, 10.0, 0.1), widest=20).size[1] == 10.0
+    assert ellipsoid((0.1, 10.0, 0.1), widest=20.2).size[1] == 10.0
     assert register(record(name="again")) is not register(record(name="again"))
 
 
