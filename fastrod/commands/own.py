@@ -215,7 +215,7 @@ def export(robot: str, *, mjcf: Path, pieces: int | None = None) -> int:
     its = load_robot(robot)
     if mjcf.suffix != ".xml":
         raise InputError(f"{str(mjcf)!r} does not end in .xml; a file of MuJoCo does.")
-    check_number("--pieces", pieces or 4, Bound(least=4, most=200), whole=True)
+    check_number("--pieces", 4 if pieces is None else pieces, Bound(least=4, most=200), whole=True)
     written(its, pieces=pieces)  # refuses before anything is computed
     said = "static error not measured: MuJoCo is not installed"
     if find_spec("mujoco") is not None:

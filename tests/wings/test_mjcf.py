@@ -36,6 +36,8 @@ def test_a_robot_without_tendons_and_a_wrong_file_are_refused(capsys: pytest.Cap
         mjcf(fastrod.load_robot("ethz_beam"))
     assert main(["export", "prototype", "--mjcf", "a.toml"]) == 2
     assert "does not end in .xml" in capsys.readouterr().err
+    assert main(["export", "prototype", "--mjcf", "a.xml", "--pieces", "0"]) == 2
+    assert "--pieces is 0; it must be a whole number from 4 to 200." in capsys.readouterr().err
 
 
 @pytest.mark.study
