@@ -363,7 +363,7 @@ ROBOTS: Rows = [
     ),
     (
         lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)),
-        r"Robot.gravity is \(0.0, 0.0, 1e\+300\); it must be 3 numbers from -1e\+09",
+        r"Robot.gravity is \(0.0, 0.0, 1e\+300\) m/s\^2; it must be 3 numbers from -1e\+09",
     ),
     *(
         (

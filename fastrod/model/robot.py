@@ -31,6 +31,7 @@ _MM = "Was it given in mm?"
 _SIZE = Bound(least=_SHORTEST, most=_LONGEST, unit="m", hint=_MM)
 _ANGLE = Bound(least=-6.2832, most=6.2832, unit="rad", hint="Was it given in degrees?")
 _ANY = Bound(least=-_MOST, most=_MOST)
+_PLACE = Bound(least=-_MOST, most=_MOST, unit="m")
 _STIFF = Bound(least=1e-20, most=1e15, unit="N m^2")
 _CURVATURE = Bound(least=-_MOST, most=_MOST, unit="1/m")
 _INERTIA = Bound(least=0.0, most=_MOST, unit="kg m^2")
@@ -90,7 +91,7 @@ class Tendon:
         check(self, error=RobotError)
         if self.unilateral and self.pretension < 0.0:
             raise RobotError(
-                f"Tendon.pretension is {self.pretension!r} N; of a wire that can go slack it must be zero or "
+                f"Tendon.pretension is {self.pretension!r} N; of one that can go slack it must be zero or "
                 "positive."
             )
 
@@ -239,11 +240,11 @@ class Robot:
 
     name: str
     segments: tuple[Segment, ...]
-    base_position: Annotated[tuple[float, float, float], _ANY] = (0.0, 0.0, 0.0)
+    base_position: Annotated[tuple[float, float, float], _PLACE] = (0.0, 0.0, 0.0)
     """World frame [m]."""
     base_quaternion: Annotated[tuple[float, float, float, float], _ANY] = (1.0, 0.0, 0.0, 0.0)
     """world_from_base, w x y z; d3 of the base is the rod's first tangent."""
-    gravity: Annotated[tuple[float, float, float], _ANY] = _GRAVITY
+    gravity: Annotated[tuple[float, float, float], Bound(least=-_MOST, most=_MOST, unit="m/s^2")] = _GRAVITY
     """World frame [m/s^2], of a robot that stands free. One that is mounted on a host feels the host's."""
     states_gravity: bool = False
     """The robot says itself which gravity it feels: a robot file with `[world] gravity`, or any other than
@@ -313,7 +314,7 @@ class Robot:
                 "arclengths; give each point one pair [m]."
             )
         for pair in self.log_offsets:
-            check_number("[log] point_offsets", pair, _ANY, count=2, error=RobotError)
+            check_number("[log] point_offsets", pair, _PLACE, count=2, error=RobotError)
 
     def _check_sensor(self) -> None:
         for key, value in self.sensor.items():

@@ -328,8 +328,8 @@ def test_similar_rods_do_the_same_however_large_and_stiff(
 
     def struck(size: float, stiff: float) -> Any:
         bends = {"bending_stiffness": (stiff * EI,) * 2, "torsional_stiffness": stiff * EI}
-        larger = {"length": size * LENGTH, "body_radius": size * RADIUS}
-        robot = rod(**bends, **larger, line_density=DENSITY * stiff / size**4)
+        lengths = {"length": size * LENGTH, "body_radius": size * RADIUS}
+        robot = rod(**bends, **lengths, line_density=DENSITY * stiff / size**4)
         scene = ContactScene(obstacles=[sphere(0.02 * size, name="ball")], rod_radius=size * RADIUS)
         sim = Simulator(robot, dt=2e-3, solver=Modal(dynamics=moving, modes=Modes(4, 2)), contact=scene)
         rows = []
