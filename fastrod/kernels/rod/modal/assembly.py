@@ -13,31 +13,9 @@ from fastrod.types import Ints
 from ...jit import kernel
 from ...vec import add, axpy, cross, dot, mul, scale, sub
 from ..lanes import Lanes, W, add_two, at, clear, get, get_mat, put, read, weighted_sum, write, write_at
+from . import fields as fd
 from .balance import balance_of_piece, pass_on, start_at_tip
-from .fields import (
-    B_BACK,
-    B_FIRST,
-    B_MASS,
-    BEYOND,
-    C_TH,
-    C_V,
-    H_D,
-    H_J,
-    I_M,
-    I_W,
-    I_WORK,
-    N_N,
-    N_POS,
-    N_R,
-    N_ROTARY,
-    N_T,
-    P_L,
-    P_RHO,
-    S_MASS,
-    S_ROW,
-    ModalWork,
-    hessian,
-)
+from .fields import ModalWork, hessian
 from .host import couple_piece, hosted
 from .interval import add_elasticity, add_local, local_of_piece
 from .modes import ModalBasis
@@ -49,19 +27,19 @@ def forces_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork, mome
     """Change of the forces on the tangents by a column (N + 1, COLUMN), into `work.force`, and of the moment
     beyond the piece, into `moment` (3,)."""
     n, beyond, piece, total = b.width.shape[0], work.beyond[0], work.piece[p], work.scratch
-    weighted_sum(total, b.integral[n], column, C_V, 3)
+    weighted_sum(total, b.integral[n], column, fd.C_V, 3)
     for w in range(W):
-        displacement = scale(read(piece, P_L, w), get(total, 0, w))
-        th, first = get(column[n], C_TH, w), get(beyond, B_FIRST, w)
-        force = axpy(read(beyond, B_MASS, w), displacement, cross(th, first))
+        displacement = scale(read(piece, fd.P_L, w), get(total, 0, w))
+        th, first = get(column[n], fd.C_TH, w), get(beyond, fd.B_FIRST, w)
+        force = axpy(read(beyond, fd.B_MASS, w), displacement, cross(th, first))
         put(total, 3, w, force)
-        put(moment, 0, w, add(cross(first, displacement), mul(get_mat(beyond, B_BACK, w), th)))
+        put(moment, 0, w, add(cross(first, displacement), mul(get_mat(beyond, fd.B_BACK, w), th)))
     for j in range(n + 1):
         to, weight = work.force[j], b.integral[n, j]
-        weighted_sum(to, b.inertia[j], column, C_V, 3)
+        weighted_sum(to, b.inertia[j], column, fd.C_V, 3)
         for w in range(W):
-            l = read(piece, P_L, w)  # noqa: E741
-            inertia = scale(work.scheme[w] * read(piece, P_RHO, w) * l * l * l, get(to, 0, w))
+            l = read(piece, fd.P_L, w)  # noqa: E741
+            inertia = scale(work.scheme[w] * read(piece, fd.P_RHO, w) * l * l * l, get(to, 0, w))
             put(to, 0, w, axpy(weight * l, get(total, 3, w), inertia))
 
 
@@ -75,12 +53,17 @@ def stations_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork) ->
             put(moved, 0, w, (0.0, 0.0, 0.0))
         for j in range(n + 1):
             for w in range(W):
-                put(moved, 0, w, axpy(read(station, S_ROW + j, w), get(column[j], C_V, w), get(moved, 0, w)))
+                put(
+                    moved,
+                    0,
+                    w,
+                    axpy(read(station, fd.S_ROW + j, w), get(column[j], fd.C_V, w), get(moved, 0, w)),
+                )
         for j in range(n + 1):
             to = work.force[j]
             for w in range(W):
-                l = read(length, P_L, w)  # noqa: E741
-                factor = l * l * work.scheme[w] * read(station, S_MASS, w) * read(station, S_ROW + j, w)
+                l = read(length, fd.P_L, w)  # noqa: E741
+                factor = l * l * work.scheme[w] * read(station, fd.S_MASS, w) * read(station, fd.S_ROW + j, w)
                 put(to, 0, w, axpy(factor, get(moved, 0, w), get(to, 0, w)))
 
 
@@ -95,16 +78,16 @@ def moments_by_column(p: int, column: Lanes, b: ModalBasis, work: ModalWork, mom
         if j < n:
             interval, later = work.interval[p, j], column[j + 1]
             for w in range(W):
-                carried = get(interval, I_M, w)
-                middle = scale(0.5, add(get(here, C_TH, w), get(later, C_TH, w)))
+                carried = get(interval, fd.I_M, w)
+                middle = scale(0.5, add(get(here, fd.C_TH, w), get(later, fd.C_TH, w)))
                 y = add(get(moment, 0, w), cross(carried, middle))
                 for f in range(6):
-                    write(interval, I_WORK + f, w, dot(get(interval, I_W + 3 * f, w), y))
+                    write(interval, fd.I_WORK + f, w, dot(get(interval, fd.I_W + 3 * f, w), y))
         force = work.force[j]
         for w in range(W):
-            grown = cross(get(here, C_V, w), get(node, N_N, w))
-            grown = add(grown, cross(get(node, N_T, w), get(force, 0, w)))
-            grown = add(grown, mul(get_mat(node, N_ROTARY, w), get(here, C_TH, w)))
+            grown = cross(get(here, fd.C_V, w), get(node, fd.N_N, w))
+            grown = add(grown, cross(get(node, fd.N_T, w), get(force, 0, w)))
+            grown = add(grown, mul(get_mat(node, fd.N_ROTARY, w), get(here, fd.C_TH, w)))
             put(moment, 0, w, add(get(moment, 0, w), grown))
 
 
@@ -115,16 +98,16 @@ def rotary_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
         node, history = work.node[p, j], work.history[p, j]
         for w in range(W):
             for f in range(9):
-                write(node, N_ROTARY + f, w, 0.0)
+                write(node, fd.N_ROTARY + f, w, 0.0)
         for k in range(3):
             for w in range(W):
-                factor, h = -work.scheme[w] * read(history, H_J + k, w), get(history, H_D + 3 * k, w)
-                d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
+                factor, h = -work.scheme[w] * read(history, fd.H_J + k, w), get(history, fd.H_D + 3 * k, w)
+                d = (read(node, fd.N_R + k, w), read(node, fd.N_R + 3 + k, w), read(node, fd.N_R + 6 + k, w))
                 both = factor * dot(d, h)
                 for r in range(3):
-                    moved = axpy(factor * d[r], h, get(node, N_ROTARY + 3 * r, w))
-                    put(node, N_ROTARY + 3 * r, w, moved)
-                    diagonal = N_ROTARY + 4 * r
+                    moved = axpy(factor * d[r], h, get(node, fd.N_ROTARY + 3 * r, w))
+                    put(node, fd.N_ROTARY + 3 * r, w, moved)
+                    diagonal = fd.N_ROTARY + 4 * r
                     write(node, diagonal, w, read(node, diagonal, w) - both)
 
 
@@ -137,13 +120,13 @@ def work_of_column(p: int, a: int, column: Lanes, b: ModalBasis, work: ModalWork
     if c < 3:
         for i in range(b.width.shape[0]):
             here, b1, b2 = work.interval[p, i], b.at_gauss[i, 0, m], b.at_gauss[i, 1, m]
-            add_two(out, 0, b1, here[(I_WORK + c) * W :], b2, here[(I_WORK + 3 + c) * W :])
+            add_two(out, 0, b1, here[(fd.I_WORK + c) * W :], b2, here[(fd.I_WORK + 3 + c) * W :])
         return
     for j in range(b.node.shape[0]):
         node, value, force = work.node[p, j], b.at_node[j, m], work.force[j]
         for w in range(W):
-            e = (read(node, N_R + c - 3, w), read(node, N_R + c, w), read(node, N_R + c + 3, w))
-            turned = cross(get(node, N_N, w), get(column[j], C_TH, w))
+            e = (read(node, fd.N_R + c - 3, w), read(node, fd.N_R + c, w), read(node, fd.N_R + c + 3, w))
+            turned = cross(get(node, fd.N_N, w), get(column[j], fd.C_TH, w))
             out[w] += value * dot(e, add(get(force, 0, w), turned))
 
 
@@ -180,8 +163,8 @@ def rotations_of_piece(p: int, b: ModalBasis, work: ModalWork, moment: Lanes, ou
         for j in range(n + 1):
             node = work.node[p, j]
             for w in range(W):
-                put(work.rigid[j], C_TH, w, axis)
-                put(work.rigid[j], C_V, w, cross(axis, get(node, N_T, w)))
+                put(work.rigid[j], fd.C_TH, w, axis)
+                put(work.rigid[j], fd.C_V, w, cross(axis, get(node, fd.N_T, w)))
         column_of_piece(p, work.rigid, b, work, moment)
         for a in range(b.component.shape[0]):
             work_of_column(p, a, work.rigid, b, work, out)
@@ -189,7 +172,7 @@ def rotations_of_piece(p: int, b: ModalBasis, work: ModalWork, moment: Lanes, ou
                 write(work.coupling[a], 3 + e, w, out[w])
         for w in range(W):
             for r in range(3):
-                write(before, B_BACK + 3 * r + e, w, read(moment, r, w))
+                write(before, fd.B_BACK + 3 * r + e, w, read(moment, r, w))
 
 
 @kernel
@@ -201,12 +184,12 @@ def displacements_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
         for w in range(W):
             put(work.coupling[a], 0, w, (0.0, 0.0, 0.0))
     for w in range(W):
-        put(first, 0, w, get(beyond, B_FIRST, w))
-        l = read(work.piece[p], P_L, w)  # noqa: E741
-        mass = work.scheme[w] * read(work.piece[p], P_RHO, w) * l
+        put(first, 0, w, get(beyond, fd.B_FIRST, w))
+        l = read(work.piece[p], fd.P_L, w)  # noqa: E741
+        mass = work.scheme[w] * read(work.piece[p], fd.P_RHO, w) * l
         for k in range(work.station.shape[1]):
-            mass += work.scheme[w] * read(work.station[p, k], S_MASS, w)
-        write(before, B_MASS, w, read(beyond, B_MASS, w) + mass)
+            mass += work.scheme[w] * read(work.station[p, k], fd.S_MASS, w)
+        write(before, fd.B_MASS, w, read(beyond, fd.B_MASS, w) + mass)
     for step in range(n + 1):
         j = n - step
         node = work.node[p, j]
@@ -217,30 +200,34 @@ def displacements_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
                 if c < 3:
                     b1, b2 = b.at_gauss[j, 0, m], b.at_gauss[j, 1, m]
                     for w in range(W):
-                        turned = scale(b1, get(interval, I_W + 3 * c, w))
-                        turned = axpy(b2, get(interval, I_W + 9 + 3 * c, w), turned)
+                        turned = scale(b1, get(interval, fd.I_W + 3 * c, w))
+                        turned = axpy(b2, get(interval, fd.I_W + 9 + 3 * c, w), turned)
                         put(to, 0, w, add(get(to, 0, w), cross(turned, get(first, 0, w))))
         for w in range(W):
-            l, alpha = read(work.piece[p], P_L, w), work.scheme[w]  # noqa: E741
+            l, alpha = read(work.piece[p], fd.P_L, w), work.scheme[w]  # noqa: E741
             weight = 0.0
             for k in range(n + 1):
                 weight += b.integral[n, k] * b.integral[k, j]
-            inertia = alpha * read(work.piece[p], P_RHO, w) * l * weight
-            inertia += b.integral[n, j] * read(beyond, B_MASS, w)
+            inertia = alpha * read(work.piece[p], fd.P_RHO, w) * l * weight
+            inertia += b.integral[n, j] * read(beyond, fd.B_MASS, w)
             for k in range(work.station.shape[1]):
                 station = work.station[p, k]
-                inertia += alpha * read(station, S_MASS, w) * read(station, S_ROW + j, w)
+                inertia += alpha * read(station, fd.S_MASS, w) * read(station, fd.S_ROW + j, w)
             write(first, 3, w, l * inertia)
-            put(first, 0, w, axpy(l * inertia, get(node, N_T, w), get(first, 0, w)))
+            put(first, 0, w, axpy(l * inertia, get(node, fd.N_T, w), get(first, 0, w)))
         for a in range(b.component.shape[0]):
             c, to = b.component[a], work.coupling[a]
             if c >= 3:
                 value = b.at_node[j, b.degree[a]]
                 for w in range(W):
-                    e = (read(node, N_R + c - 3, w), read(node, N_R + c, w), read(node, N_R + c + 3, w))
+                    e = (
+                        read(node, fd.N_R + c - 3, w),
+                        read(node, fd.N_R + c, w),
+                        read(node, fd.N_R + c + 3, w),
+                    )
                     put(to, 0, w, axpy(value * read(first, 3, w), e, get(to, 0, w)))
     for w in range(W):
-        put(before, B_FIRST, w, get(first, 0, w))
+        put(before, fd.B_FIRST, w, get(first, 0, w))
 
 
 @kernel
@@ -256,7 +243,7 @@ def coupling_of_piece(p: int, b: ModalBasis, work: ModalWork) -> None:
                 gamma, row, col = work.coupling[a], p * n_modes + a, before * n_modes + c
                 for w in range(W):
                     th = get(end, 3, w)
-                    arm = sub(get(start, N_POS, w), get(last, N_POS, w))
+                    arm = sub(get(start, fd.N_POS, w), get(last, fd.N_POS, w))
                     moved = add(get(end, 0, w), cross(th, arm))
                     both = dot(get(gamma, 0, w), moved) + dot(get(gamma, 3, w), th)
                     write_at(hessian(work), row, col, w, both)
@@ -283,7 +270,7 @@ def assemble(b: ModalBasis, first_tendon: Ints, work: ModalWork) -> None:
         if hosted(work):
             couple_piece(p, b, work)
         pass_on(p, b, work)
-        for i in range(BEYOND * W):
+        for i in range(fd.BEYOND * W):
             work.beyond[0, i] = work.beyond[1, i]
         add_elasticity(p, b, work)
     add_tendons(first_tendon, work, out)

@@ -6,42 +6,8 @@ from __future__ import annotations
 from ...jit import kernel
 from ...vec import add, axpy, cross, dot, scale, sub
 from ..lanes import W, at, get, put, read, write
-from .fields import (
-    B_F,
-    B_M,
-    H_D,
-    H_J,
-    H_LINE,
-    H_MOMENT,
-    H_POS,
-    I_DK,
-    I_HISTORY,
-    I_M,
-    I_STAR,
-    I_U,
-    I_W,
-    I_WORK,
-    N_C,
-    N_F,
-    N_MU,
-    N_N,
-    N_POS,
-    N_R,
-    N_T,
-    P_K,
-    P_L,
-    P_RHO,
-    P_TAU,
-    P_UNEVEN,
-    S_F,
-    S_GIVEN,
-    S_HISTORY,
-    S_MASS,
-    S_POS,
-    S_ROW,
-    ModalWork,
-    path_change,
-)
+from . import fields as fd
+from .fields import ModalWork, path_change
 from .modes import ModalBasis
 
 
@@ -52,8 +18,8 @@ def start_at_tip(work: ModalWork) -> None:
     for i in range(len(beyond)):
         beyond[i] = 0.0
     for w in range(W):
-        put(beyond, B_F, w, scale(-1.0, get(work.outside, 0, w)))
-        put(beyond, B_M, w, scale(-1.0, get(work.outside, 3, w)))
+        put(beyond, fd.B_F, w, scale(-1.0, get(work.outside, 0, w)))
+        put(beyond, fd.B_M, w, scale(-1.0, get(work.outside, 3, w)))
 
 
 @kernel
@@ -67,17 +33,17 @@ def demands_of_nodes(p: int, b: ModalBasis, work: ModalWork) -> None:
     for j in range(n + 1):
         node, history, weight = work.node[p, j], work.history[p, j], b.integral[n, j]
         for w in range(W):
-            extent, alpha = weight * read(piece, P_L, w), work.scheme[w]
-            moved = sub(get(node, N_POS, w), get(history, H_POS, w))
-            inertia = scale(extent * read(piece, P_RHO, w) * alpha, moved)
-            put(node, N_F, w, axpy(-extent, get(history, H_LINE, w), inertia))
-            put(node, N_C, w, scale(-1.0, get(history, H_MOMENT, w)))
+            extent, alpha = weight * read(piece, fd.P_L, w), work.scheme[w]
+            moved = sub(get(node, fd.N_POS, w), get(history, fd.H_POS, w))
+            inertia = scale(extent * read(piece, fd.P_RHO, w) * alpha, moved)
+            put(node, fd.N_F, w, axpy(-extent, get(history, fd.H_LINE, w), inertia))
+            put(node, fd.N_C, w, scale(-1.0, get(history, fd.H_MOMENT, w)))
         for k in range(3):
             for w in range(W):
-                d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
-                inertia = cross(d, get(history, H_D + 3 * k, w))
-                factor = -work.scheme[w] * read(history, H_J + k, w)
-                put(node, N_C, w, axpy(factor, inertia, get(node, N_C, w)))
+                d = (read(node, fd.N_R + k, w), read(node, fd.N_R + 3 + k, w), read(node, fd.N_R + 6 + k, w))
+                inertia = cross(d, get(history, fd.H_D + 3 * k, w))
+                factor = -work.scheme[w] * read(history, fd.H_J + k, w)
+                put(node, fd.N_C, w, axpy(factor, inertia, get(node, fd.N_C, w)))
 
 
 @kernel
@@ -87,19 +53,19 @@ def demands_of_stations(p: int, b: ModalBasis, work: ModalWork) -> None:
     for k in range(work.station.shape[1]):
         station = work.station[p, k]
         for w in range(W):
-            put(station, S_POS, w, (0.0, 0.0, 0.0))
+            put(station, fd.S_POS, w, (0.0, 0.0, 0.0))
         for j in range(b.node.shape[0]):
             node = work.node[p, j]
             for w in range(W):
-                grown = axpy(read(station, S_ROW + j, w), get(node, N_T, w), get(station, S_POS, w))
-                put(station, S_POS, w, grown)
+                grown = axpy(read(station, fd.S_ROW + j, w), get(node, fd.N_T, w), get(station, fd.S_POS, w))
+                put(station, fd.S_POS, w, grown)
         for w in range(W):
-            position = axpy(read(length, P_L, w), get(station, S_POS, w), get(start, N_POS, w))
-            mass = read(station, S_MASS, w)
-            inertia = scale(mass * work.scheme[w], sub(position, get(station, S_HISTORY, w)))
-            weight = axpy(mass, get(work.outside, 6, w), get(station, S_GIVEN, w))
-            put(station, S_POS, w, position)
-            put(station, S_F, w, sub(inertia, weight))
+            position = axpy(read(length, fd.P_L, w), get(station, fd.S_POS, w), get(start, fd.N_POS, w))
+            mass = read(station, fd.S_MASS, w)
+            inertia = scale(mass * work.scheme[w], sub(position, get(station, fd.S_HISTORY, w)))
+            weight = axpy(mass, get(work.outside, 6, w), get(station, fd.S_GIVEN, w))
+            put(station, fd.S_POS, w, position)
+            put(station, fd.S_F, w, sub(inertia, weight))
 
 
 @kernel
@@ -109,19 +75,24 @@ def forces_on_tangents(p: int, b: ModalBasis, work: ModalWork) -> None:
     for j in range(n + 1):
         to, weight = node[j], b.integral[n, j]
         for w in range(W):
-            put(to, N_N, w, scale(weight, get(beyond, B_F, w)))
+            put(to, fd.N_N, w, scale(weight, get(beyond, fd.B_F, w)))
         for k in range(n + 1):
             s, at_k = b.integral[k, j], node[k]
             for w in range(W):
-                put(to, N_N, w, axpy(s, get(at_k, N_F, w), get(to, N_N, w)))
+                put(to, fd.N_N, w, axpy(s, get(at_k, fd.N_F, w), get(to, fd.N_N, w)))
         for k in range(work.station.shape[1]):
             station = work.station[p, k]
             for w in range(W):
-                put(to, N_N, w, axpy(read(station, S_ROW + j, w), get(station, S_F, w), get(to, N_N, w)))
+                put(
+                    to,
+                    fd.N_N,
+                    w,
+                    axpy(read(station, fd.S_ROW + j, w), get(station, fd.S_F, w), get(to, fd.N_N, w)),
+                )
         for w in range(W):
-            force = scale(read(work.piece[p], P_L, w), get(to, N_N, w))
-            put(to, N_N, w, force)
-            put(to, N_MU, w, add(cross(get(to, N_T, w), force), get(to, N_C, w)))
+            force = scale(read(work.piece[p], fd.P_L, w), get(to, fd.N_N, w))
+            put(to, fd.N_N, w, force)
+            put(to, fd.N_MU, w, add(cross(get(to, fd.N_T, w), force), get(to, fd.N_C, w)))
 
 
 @kernel
@@ -132,12 +103,14 @@ def moments_of_intervals(p: int, b: ModalBasis, work: ModalWork) -> None:
         i = n - 1 - step
         here, node = work.interval[p, i], work.node[p, i + 1]
         for w in range(W):
-            carried = get(beyond, B_M, w) if step == 0 else get(work.interval[p, min(i + 1, n - 1)], I_M, w)
-            moment = add(carried, get(node, N_MU, w))
-            put(here, I_M, w, moment)
+            carried = (
+                get(beyond, fd.B_M, w) if step == 0 else get(work.interval[p, min(i + 1, n - 1)], fd.I_M, w)
+            )
+            moment = add(carried, get(node, fd.N_MU, w))
+            put(here, fd.I_M, w, moment)
             for f in range(6):
-                write(here, I_WORK + f, w, dot(get(here, I_W + 3 * f, w), moment))
-    if work.piece[p, P_UNEVEN * W] > 0.0:
+                write(here, fd.I_WORK + f, w, dot(get(here, fd.I_W + 3 * f, w), moment))
+    if work.piece[p, fd.P_UNEVEN * W] > 0.0:
         add_uneven(p, b, work)
 
 
@@ -149,11 +122,11 @@ def add_uneven(p: int, b: ModalBasis, work: ModalWork) -> None:
         here = work.interval[p, i]
         for f in range(6):
             for w in range(W):
-                strain = read(here, I_U + f, w) - read(here, I_STAR + f, w)
-                rate = work.scheme[W + w] * (strain - read(here, I_HISTORY + f, w))
-                k = 0.5 * b.width[i] * read(piece, P_L, w) * read(here, I_DK + f, w)
-                more = k * (strain + read(piece, P_TAU, w) * rate)
-                write(here, I_WORK + f, w, read(here, I_WORK + f, w) + more)
+                strain = read(here, fd.I_U + f, w) - read(here, fd.I_STAR + f, w)
+                rate = work.scheme[W + w] * (strain - read(here, fd.I_HISTORY + f, w))
+                k = 0.5 * b.width[i] * read(piece, fd.P_L, w) * read(here, fd.I_DK + f, w)
+                more = k * (strain + read(piece, fd.P_TAU, w) * rate)
+                write(here, fd.I_WORK + f, w, read(here, fd.I_WORK + f, w) + more)
 
 
 @kernel
@@ -166,19 +139,19 @@ def work_on_mode(p: int, a: int, b: ModalBasis, work: ModalWork) -> None:
     for w in range(W):
         q = read(work.q, row, w)
         rate = work.scheme[W + w] * (q - read(work.q_history, row, w))
-        k = gram * read(piece, P_L, w) * read(piece, P_K + c, w)
-        to[w] = k * (q + read(piece, P_TAU, w) * rate)
+        k = gram * read(piece, fd.P_L, w) * read(piece, fd.P_K + c, w)
+        to[w] = k * (q + read(piece, fd.P_TAU, w) * rate)
     if c < 3:
         for i in range(n):
             here, b1, b2 = work.interval[p, i], b.at_gauss[i, 0, m], b.at_gauss[i, 1, m]
             for w in range(W):
-                to[w] += b1 * read(here, I_WORK + c, w) + b2 * read(here, I_WORK + 3 + c, w)
+                to[w] += b1 * read(here, fd.I_WORK + c, w) + b2 * read(here, fd.I_WORK + 3 + c, w)
     else:
         for j in range(n + 1):
             node, value = work.node[p, j], b.at_node[j, m]
             for w in range(W):
-                e = (read(node, N_R + c - 3, w), read(node, N_R + c, w), read(node, N_R + c + 3, w))
-                to[w] += value * dot(e, get(node, N_N, w))
+                e = (read(node, fd.N_R + c - 3, w), read(node, fd.N_R + c, w), read(node, fd.N_R + c + 3, w))
+                to[w] += value * dot(e, get(node, fd.N_N, w))
     for t in range(len(work.tension) // W):
         for w in range(W):
             to[w] += work.tension[t * W + w] * at(path_change(work), t, row, w)
@@ -200,13 +173,13 @@ def pass_on(p: int, b: ModalBasis, work: ModalWork) -> None:
     """Force and moment beyond the piece before this one, into the second row of `beyond`."""
     beyond, before, n = work.beyond[0], work.beyond[1], b.width.shape[0]
     for w in range(W):
-        put(before, B_F, w, get(beyond, B_F, w))
-        put(before, B_M, w, add(get(work.interval[p, 0], I_M, w), get(work.node[p, 0], N_MU, w)))
+        put(before, fd.B_F, w, get(beyond, fd.B_F, w))
+        put(before, fd.B_M, w, add(get(work.interval[p, 0], fd.I_M, w), get(work.node[p, 0], fd.N_MU, w)))
     for j in range(n + 1):
         node = work.node[p, j]
         for w in range(W):
-            put(before, B_F, w, add(get(before, B_F, w), get(node, N_F, w)))
+            put(before, fd.B_F, w, add(get(before, fd.B_F, w), get(node, fd.N_F, w)))
     for k in range(work.station.shape[1]):
         station = work.station[p, k]
         for w in range(W):
-            put(before, B_F, w, add(get(before, B_F, w), get(station, S_F, w)))
+            put(before, fd.B_F, w, add(get(before, fd.B_F, w), get(station, fd.S_F, w)))

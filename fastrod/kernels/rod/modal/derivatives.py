@@ -10,30 +10,10 @@ from ...jit import entry, inline, kernel
 from ...vec import Vec, add, axpy, cross, scale, sub
 from ..gather import scatter
 from ..lanes import W, at, get, get_mat, put, read, write
+from . import fields as fd
 from .assembly import assemble
 from .chunk import ModalRun, gather_all
-from .fields import (
-    C_TH,
-    C_V,
-    G_ON,
-    G_P,
-    H_D,
-    H_FOLLOW,
-    H_J,
-    H_POS,
-    N_POS,
-    N_R,
-    P_L,
-    P_RHO,
-    P_UNEVEN,
-    S_HISTORY,
-    S_MASS,
-    S_POS,
-    S_ROW,
-    ModalWork,
-    hessian,
-    one_task,
-)
+from .fields import ModalWork, hessian, one_task
 from .follower import follow, tip_motion
 from .gather import ModalBatch
 from .host import demand_of_base, hosted, no_host, put_base, rigid_stiffness, start_host
@@ -102,13 +82,17 @@ def count_from_here(work: ModalWork) -> None:
         for j in range(work.node.shape[1]):
             node, history = work.node[p, j], work.history[p, j]
             for w in range(W):
-                put(history, H_POS, w, get(node, N_POS, w))
+                put(history, fd.H_POS, w, get(node, fd.N_POS, w))
                 for k in range(3):
-                    d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
-                    put(history, H_D + 3 * k, w, d)
+                    d = (
+                        read(node, fd.N_R + k, w),
+                        read(node, fd.N_R + 3 + k, w),
+                        read(node, fd.N_R + 6 + k, w),
+                    )
+                    put(history, fd.H_D + 3 * k, w, d)
         for k in range(work.station.shape[1]):
             for w in range(W):
-                put(work.station[p, k], S_HISTORY, w, get(work.station[p, k], S_POS, w))
+                put(work.station[p, k], fd.S_HISTORY, w, get(work.station[p, k], fd.S_POS, w))
 
 
 @kernel
@@ -130,8 +114,8 @@ def write_tip(robots: Ints, n_robots: int, work: ModalWork, out: ModalDerivative
     """Gradient, and pose and motion of the tip."""
     n_modes, node = work.end.shape[1], work.node[-1, work.node.shape[1] - 1]
     for w in range(n_robots):
-        i, r = robots[w], get_mat(node, N_R, w)
-        scatter(out.position[i], get(node, N_POS, w))
+        i, r = robots[w], get_mat(node, fd.N_R, w)
+        scatter(out.position[i], get(node, fd.N_POS, w))
         force, dead = get(work.outside, 0, w), get(work.outside, 9, w)
         scatter(out.force[i], (force[0] - dead[0], force[1] - dead[1], force[2] - dead[2]))
         for k in range(3):
@@ -148,15 +132,15 @@ def displaced(p: int, c: int, row: Floats, w: int, b: ModalBasis, work: ModalWor
     """Displacement of a place of piece p, whose row of the integration this is, by mode c of the piece."""
     moved = (0.0, 0.0, 0.0)
     for j in range(b.node.shape[0]):
-        moved = axpy(row[j], get(work.column[p, c, j], C_V, w), moved)
-    return scale(read(work.piece[p], P_L, w), moved)
+        moved = axpy(row[j], get(work.column[p, c, j], fd.C_V, w), moved)
+    return scale(read(work.piece[p], fd.P_L, w), moved)
 
 
 @inline
 def carried(p: int, c: int, place: Vec, w: int, work: ModalWork) -> tuple[Vec, Vec]:
     """Displacement and rotation of a place beyond piece p by its mode c."""
     th = get(work.end[p, c], 3, w)
-    arm = sub(place, get(work.node[p, work.node.shape[1] - 1], N_POS, w))
+    arm = sub(place, get(work.node[p, work.node.shape[1] - 1], fd.N_POS, w))
     return add(get(work.end[p, c], 0, w), cross(th, arm)), th
 
 
@@ -167,26 +151,32 @@ def write_nodes(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, out
     for w in range(n_robots):
         i, m = robots[w], 0
         for p in range(n_pieces):
-            mass = read(work.piece[p], P_L, w) * read(work.piece[p], P_RHO, w)
+            mass = read(work.piece[p], fd.P_L, w) * read(work.piece[p], fd.P_RHO, w)
             for j in range(n_nodes):
                 if out.line.shape[1] > 0:
-                    extent = b.integral[-1, j] * read(work.piece[p], P_L, w)
-                    scatter(out.line[i, p * n_nodes + j], scale(extent, get(work.history[p, j], H_FOLLOW, w)))
-                node, place = work.node[p, j], get(work.node[p, j], N_POS, w)
+                    extent = b.integral[-1, j] * read(work.piece[p], fd.P_L, w)
+                    scatter(
+                        out.line[i, p * n_nodes + j], scale(extent, get(work.history[p, j], fd.H_FOLLOW, w))
+                    )
+                node, place = work.node[p, j], get(work.node[p, j], fd.N_POS, w)
                 for f in range(NODE_VECTORS):
                     out.number[i, m + f] = node_number(node, f, w)
-                    spin = read(work.history[p, j], H_J + max(f - 3, 0) // 3, w)
+                    spin = read(work.history[p, j], fd.H_J + max(f - 3, 0) // 3, w)
                     out.inertia[i, m + f] = b.integral[-1, j] * mass if f < 3 else spin
                 for a in range((p + 1) * n_modes):
                     before, c = a // n_modes, a % n_modes
                     if before < p:
                         moved, th = carried(before, c, place, w, work)
                     else:
-                        th = get(work.column[p, c, j], C_TH, w)
+                        th = get(work.column[p, c, j], fd.C_TH, w)
                         moved = displaced(p, c, b.integral[j], w, b, work)
                     for k in range(3):
                         out.number_change[i, m + k, a] = moved[k]
-                        d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
+                        d = (
+                            read(node, fd.N_R + k, w),
+                            read(node, fd.N_R + 3 + k, w),
+                            read(node, fd.N_R + 6 + k, w),
+                        )
                         turned = cross(th, d)
                         for f in range(3):
                             out.number_change[i, m + 3 + 3 * k + f, a] = turned[f]
@@ -216,11 +206,11 @@ def write_lumps(
         for p in range(n_pieces):
             for k in range(n):
                 station = work.station[p, k]
-                place = get(station, S_POS, w)
+                place = get(station, fd.S_POS, w)
                 for j in range(n_nodes):
-                    row[j] = read(station, S_ROW + j, w)
+                    row[j] = read(station, fd.S_ROW + j, w)
                 scatter(out.number[i, m : m + 3], place)
-                mass = read(station, S_MASS, w)
+                mass = read(station, fd.S_MASS, w)
                 scatter(out.inertia[i, m : m + 3], (mass, mass, mass))
                 for a in range((p + 1) * n_modes):
                     moved = _moved_by(a, p, place, row, w, batch, work)
@@ -240,9 +230,9 @@ def write_points(
         for q in range(n_points):
             p = batch.points.piece[i, q]
             station = work.station[p, work.station.shape[1] - n_points + q]
-            place = get(station, S_POS, w)
+            place = get(station, fd.S_POS, w)
             for j in range(work.node.shape[1]):
-                row[j] = read(station, S_ROW + j, w)
+                row[j] = read(station, fd.S_ROW + j, w)
             scatter(out.point[i, q], place)
             slope = batch.points.slope[i, q]
             for a in range((p + 1) * n_modes):
@@ -251,7 +241,7 @@ def write_points(
                     turned = get(work.end[a // n_modes, a % n_modes], 3, w)
                 else:
                     for j in range(work.node.shape[1]):
-                        turned = axpy(slope[j], get(work.column[p, a % n_modes, j], C_TH, w), turned)
+                        turned = axpy(slope[j], get(work.column[p, a % n_modes, j], fd.C_TH, w), turned)
                 for f in range(3):
                     out.point_change[i, q, f, a] = moved[f]
                     out.point_rotation[i, q, f, a] = turned[f]
@@ -266,7 +256,7 @@ def write_base(
     n_q, n_points = len(work.q) // W, out.point_change.shape[1]
     demand_of_base(robots, batch.basis, batch.motion, work, work.scratch)
     for w in range(n_robots):
-        i, base, on = robots[w], get(work.base, 9, w), read(work.host, G_ON, w) > 0.0
+        i, base, on = robots[w], get(work.base, 9, w), read(work.host, fd.G_ON, w) > 0.0
         for r in range(6):
             a = n_q + r
             if not on:
@@ -274,7 +264,7 @@ def write_base(
                 continue
             out.gradient[i, a] = read(work.scratch, r, w)
             for c in range(r + 1):
-                stiffness = rigid_stiffness(work, r, c, w) + read(work.host, G_P + 6 * r + c, w)
+                stiffness = rigid_stiffness(work, r, c, w) + read(work.host, fd.G_P + 6 * r + c, w)
                 out.hessian[i, a, n_q + c] = out.hessian[i, n_q + c, a] = stiffness
             for c in range(n_q):
                 coupled = read(work.host_change, r * n_q + c, w)
@@ -310,7 +300,7 @@ def derivatives_of_modes(
         begin_step(robots, batch.motion, scheme, jump, work)
         if run.kind == AFTER_JUMP:
             base_soon(robots, batch.motion, scheme, run.dt, work.base)
-        if work.piece[0, P_UNEVEN * W] > 0.0:
+        if work.piece[0, fd.P_UNEVEN * W] > 0.0:
             curvature_counted_from(batch.basis, work)
     if run.kind == REST or run.kind == AFTER_JUMP:
         no_host(work)

@@ -8,29 +8,8 @@ from fastrod.types import Floats
 from ...jit import kernel
 from ...vec import axpy, dot, sub
 from ..lanes import Lanes, W, get, read
-from .fields import (
-    H_D,
-    H_J,
-    H_LINE,
-    H_POS,
-    I_DK,
-    I_HISTORY,
-    I_STAR,
-    I_U,
-    N_POS,
-    N_R,
-    N_T,
-    P_K,
-    P_L,
-    P_RHO,
-    P_TAU,
-    P_UNEVEN,
-    S_GIVEN,
-    S_HISTORY,
-    S_MASS,
-    S_ROW,
-    ModalWork,
-)
+from . import fields as fd
+from .fields import ModalWork
 from .host import add_energy_of_base, hosted
 from .modes import ModalBasis
 
@@ -42,16 +21,16 @@ def energy_of_nodes(p: int, b: ModalBasis, work: ModalWork, energy: Lanes) -> No
     for j in range(n + 1):
         node, history, weight = work.node[p, j], work.history[p, j], b.integral[n, j]
         for w in range(W):
-            extent, alpha = weight * read(piece, P_L, w), 0.5 * work.scheme[w]
-            rho, position = read(piece, P_RHO, w), get(node, N_POS, w)
-            moved = sub(position, get(history, H_POS, w))
-            given = dot(get(history, H_LINE, w), position)
+            extent, alpha = weight * read(piece, fd.P_L, w), 0.5 * work.scheme[w]
+            rho, position = read(piece, fd.P_RHO, w), get(node, fd.N_POS, w)
+            moved = sub(position, get(history, fd.H_POS, w))
+            given = dot(get(history, fd.H_LINE, w), position)
             energy[w] += extent * (rho * alpha * dot(moved, moved) - given)
         for k in range(3):
             for w in range(W):
-                d = (read(node, N_R + k, w), read(node, N_R + 3 + k, w), read(node, N_R + 6 + k, w))
-                turned = sub(d, get(history, H_D + 3 * k, w))
-                energy[w] += 0.5 * work.scheme[w] * read(history, H_J + k, w) * dot(turned, turned)
+                d = (read(node, fd.N_R + k, w), read(node, fd.N_R + 3 + k, w), read(node, fd.N_R + 6 + k, w))
+                turned = sub(d, get(history, fd.H_D + 3 * k, w))
+                energy[w] += 0.5 * work.scheme[w] * read(history, fd.H_J + k, w) * dot(turned, turned)
 
 
 @kernel
@@ -61,12 +40,12 @@ def energy_of_stations(p: int, b: ModalBasis, work: ModalWork, energy: Lanes) ->
     for k in range(work.station.shape[1]):
         station = work.station[p, k]
         for w in range(W):
-            position = get(start, N_POS, w)
+            position = get(start, fd.N_POS, w)
             for j in range(b.node.shape[0]):
-                step = read(length, P_L, w) * read(station, S_ROW + j, w)
-                position = axpy(step, get(work.node[p, j], N_T, w), position)
-            moved, mass = sub(position, get(station, S_HISTORY, w)), read(station, S_MASS, w)
-            pulled = axpy(mass, get(work.outside, 6, w), get(station, S_GIVEN, w))
+                step = read(length, fd.P_L, w) * read(station, fd.S_ROW + j, w)
+                position = axpy(step, get(work.node[p, j], fd.N_T, w), position)
+            moved, mass = sub(position, get(station, fd.S_HISTORY, w)), read(station, fd.S_MASS, w)
+            pulled = axpy(mass, get(work.outside, 6, w), get(station, fd.S_GIVEN, w))
             energy[w] += 0.5 * mass * work.scheme[w] * dot(moved, moved) - dot(pulled, position)
 
 
@@ -79,8 +58,8 @@ def energy_of_modes(p: int, b: ModalBasis, work: ModalWork, energy: Lanes) -> No
         for w in range(W):
             q = read(work.q, row, w)
             moved = q - read(work.q_history, row, w)
-            k = gram * read(piece, P_L, w) * read(piece, P_K + c, w)
-            energy[w] += k * (q * q + read(piece, P_TAU, w) * work.scheme[W + w] * moved * moved)
+            k = gram * read(piece, fd.P_L, w) * read(piece, fd.P_K + c, w)
+            energy[w] += k * (q * q + read(piece, fd.P_TAU, w) * work.scheme[W + w] * moved * moved)
 
 
 @kernel
@@ -91,10 +70,10 @@ def energy_of_uneven(p: int, b: ModalBasis, work: ModalWork, energy: Lanes) -> N
         here = work.interval[p, i]
         for f in range(6):
             for w in range(W):
-                strain = read(here, I_U + f, w) - read(here, I_STAR + f, w)
-                moved = strain - read(here, I_HISTORY + f, w)
-                damped = read(piece, P_TAU, w) * work.scheme[W + w] * moved * moved
-                k = 0.25 * b.width[i] * read(piece, P_L, w) * read(here, I_DK + f, w)
+                strain = read(here, fd.I_U + f, w) - read(here, fd.I_STAR + f, w)
+                moved = strain - read(here, fd.I_HISTORY + f, w)
+                damped = read(piece, fd.P_TAU, w) * work.scheme[W + w] * moved * moved
+                k = 0.25 * b.width[i] * read(piece, fd.P_L, w) * read(here, fd.I_DK + f, w)
                 energy[w] += k * (strain * strain + damped)
 
 
@@ -124,11 +103,11 @@ def energy_of_shape(b: ModalBasis, command: Floats, work: ModalWork, energy: Lan
         energy_of_nodes(p, b, work, energy)
         energy_of_stations(p, b, work, energy)
         energy_of_modes(p, b, work, energy)
-        if work.piece[p, P_UNEVEN * W] > 0.0:
+        if work.piece[p, fd.P_UNEVEN * W] > 0.0:
             energy_of_uneven(p, b, work, energy)
     energy_of_tendons(command, work, energy)
     last = work.node[work.piece.shape[0] - 1, b.width.shape[0]]
     for w in range(W):
-        energy[w] -= dot(get(work.outside, 0, w), get(last, N_POS, w))
+        energy[w] -= dot(get(work.outside, 0, w), get(last, fd.N_POS, w))
     if hosted(work):
         add_energy_of_base(work, energy)

@@ -12,25 +12,8 @@ from ...jit import entry, inline, kernel
 from ...vec import Vec, axpy, from_quaternion, scale, sub
 from ..gather import pick
 from ..lanes import Lanes, W, get, put, put_mat, write
-from .fields import (
-    H_DEAD,
-    H_FOLLOW,
-    H_J,
-    H_LINE,
-    H_MOMENT,
-    I_DK,
-    I_STAR,
-    P_FOLLOWED,
-    P_K,
-    P_L,
-    P_RHO,
-    P_TAU,
-    P_UNEVEN,
-    S_GIVEN,
-    S_MASS,
-    S_ROW,
-    ModalWork,
-)
+from . import fields as fd
+from .fields import ModalWork
 from .host import ModalHost
 from .modes import GAUSS, ModalBasis
 from .motion import ModalMotion
@@ -145,13 +128,13 @@ def gather_pieces(
             length += ports.extension[pick(i, len(ports.extension)), k]
             axial = pieces.axial[pick(i, len(pieces.axial)), k]
             density = pieces.density[pick(i, len(pieces.density)), k]
-            write(piece, P_L, w, fraction * length)
-            put(piece, P_K + 3, w, _vec(axial))
-            write(piece, P_TAU, w, pieces.damping_time[pick(i, len(pieces.damping_time)), k])
-            write(piece, P_RHO, w, density[0])
+            write(piece, fd.P_L, w, fraction * length)
+            put(piece, fd.P_K + 3, w, _vec(axial))
+            write(piece, fd.P_TAU, w, pieces.damping_time[pick(i, len(pieces.damping_time)), k])
+            write(piece, fd.P_RHO, w, density[0])
             for j in range(b.node.shape[0]):
                 extent = b.integral[-1, j] * fraction * length
-                put(work.history[p, j], H_J, w, (extent * density[1], extent * density[2], 0.0))
+                put(work.history[p, j], fd.H_J, w, (extent * density[1], extent * density[2], 0.0))
             offset = params.offset[pick(i, len(params.offset)), k]
             for t in range(pieces.first_tendon[p], offset.shape[0]):
                 write(work.offset[p], 2 * t, w, offset[t, 0])
@@ -187,17 +170,17 @@ def gather_material(robots: Ints, ports: Ports, pieces: ModalPieces, b: ModalBas
                 here = work.interval[p, j]
                 for g in range(2):
                     x = first + fraction * (b.node[j] + b.width[j] * GAUSS[g])
-                    put(here, I_STAR + 3 * g, w, along(precurvature, x))
+                    put(here, fd.I_STAR + 3 * g, w, along(precurvature, x))
                     if uneven > 0.0:
                         there = along(stiffness, x)
-                        put(here, I_DK + 3 * g, w, there)
+                        put(here, fd.I_DK + 3 * g, w, there)
                         mean = axpy(0.5 * b.width[j], there, mean)
-            write(piece, P_UNEVEN, w, uneven)
-            put(piece, P_K, w, mean)
+            write(piece, fd.P_UNEVEN, w, uneven)
+            put(piece, fd.P_K, w, mean)
             for j in range(b.width.shape[0] if uneven > 0.0 else 0):
                 for g in range(2):
-                    there = get(work.interval[p, j], I_DK + 3 * g, w)
-                    put(work.interval[p, j], I_DK + 3 * g, w, sub(there, mean))
+                    there = get(work.interval[p, j], fd.I_DK + 3 * g, w)
+                    put(work.interval[p, j], fd.I_DK + 3 * g, w, sub(there, mean))
 
 
 @inline
@@ -241,15 +224,15 @@ def gather_loads(robots: Ints, ports: Ports, pieces: ModalPieces, b: ModalBasis,
             first, last = pieces.bound[p]
             for j in range(b.node.shape[0]):
                 x = first + b.node[j] * (last - first)
-                put(work.history[p, j], H_LINE, w, _line_force(line, grids, x))
+                put(work.history[p, j], fd.H_LINE, w, _line_force(line, grids, x))
             followed = len(ports.follower_line) > 0
-            write(work.piece[p], P_FOLLOWED, w, 1.0 if followed else 0.0)
+            write(work.piece[p], fd.P_FOLLOWED, w, 1.0 if followed else 0.0)
             if followed:
                 own_line = ports.follower_line[pick(i, len(ports.follower_line)), pieces.segment[p]]
                 for j in range(b.node.shape[0]):
                     x, history = first + b.node[j] * (last - first), work.history[p, j]
-                    put(history, H_DEAD, w, get(history, H_LINE, w))
-                    put(history, H_FOLLOW, w, _line_force(own_line, grids, x))
+                    put(history, fd.H_DEAD, w, get(history, fd.H_LINE, w))
+                    put(history, fd.H_FOLLOW, w, _line_force(own_line, grids, x))
 
 
 @kernel
@@ -281,14 +264,14 @@ def gather_lumps(robots: Ints, pieces: ModalPieces, work: ModalWork) -> None:
         for w in range(W):
             i = robots[w]
             row = pieces.lump_row[pick(i, len(pieces.lump_row)), q]
-            write(to, S_MASS, w, pieces.lump[pick(i, len(pieces.lump)), q])
-            put(to, S_GIVEN, w, (0.0, 0.0, 0.0))
+            write(to, fd.S_MASS, w, pieces.lump[pick(i, len(pieces.lump)), q])
+            put(to, fd.S_GIVEN, w, (0.0, 0.0, 0.0))
             spin = pieces.lump_spin[pick(i, len(pieces.lump_spin)), q]
             weight = pieces.lump_weight[pick(i, len(pieces.lump_weight)), q]
             for j in range(row.shape[0]):
-                write(to, S_ROW + j, w, row[j])
+                write(to, fd.S_ROW + j, w, row[j])
                 node = work.history[pieces.lump_piece[q], j]
-                put(node, H_J, w, axpy(weight[j], _vec(spin), get(node, H_J, w)))
+                put(node, fd.H_J, w, axpy(weight[j], _vec(spin), get(node, fd.H_J, w)))
 
 
 @kernel
@@ -298,14 +281,14 @@ def gather_points(robots: Ints, points: ModalPoints, work: ModalWork) -> None:
     for p in range(work.station.shape[0]):
         for j in range(work.node.shape[1]):
             for w in range(W):
-                put(work.history[p, j], H_MOMENT, w, (0.0, 0.0, 0.0))
+                put(work.history[p, j], fd.H_MOMENT, w, (0.0, 0.0, 0.0))
     for q in range(n):
         for w in range(W):
             i = robots[w]
             moment = _vec(points.moment[i, q])
             for j in range(work.node.shape[1]):
                 node = work.history[points.piece[i, q], j]
-                put(node, H_MOMENT, w, axpy(points.slope[i, q, j], moment, get(node, H_MOMENT, w)))
+                put(node, fd.H_MOMENT, w, axpy(points.slope[i, q, j], moment, get(node, fd.H_MOMENT, w)))
     first = work.station.shape[1] - n
     for q in range(n):
         for p in range(work.station.shape[0]):
@@ -313,7 +296,7 @@ def gather_points(robots: Ints, points: ModalPoints, work: ModalWork) -> None:
             for w in range(W):
                 i = robots[w]
                 here = points.piece[i, q] == p
-                write(to, S_MASS, w, 0.0)
-                put(to, S_GIVEN, w, _vec(points.force[i, q]) if here else (0.0, 0.0, 0.0))
+                write(to, fd.S_MASS, w, 0.0)
+                put(to, fd.S_GIVEN, w, _vec(points.force[i, q]) if here else (0.0, 0.0, 0.0))
                 for j in range(points.row.shape[2]):
-                    write(to, S_ROW + j, w, points.row[i, q, j] if here else 0.0)
+                    write(to, fd.S_ROW + j, w, points.row[i, q, j] if here else 0.0)

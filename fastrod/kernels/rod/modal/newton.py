@@ -12,34 +12,11 @@ from fastrod.types import Floats, Ints
 from ...jit import inline, kernel
 from ...vec import Vec, dot
 from ..lanes import W, at, clear, get, get_mat, put_mat, read, write, write_at
+from . import fields as fd
 from .assembly import assemble
 from .cholesky import backward, factor, forward
 from .energy import energy_of_shape
-from .fields import (
-    G_D,
-    G_LIGHT,
-    G_ON,
-    G_STEP,
-    L_AGAIN,
-    L_BEFORE,
-    L_CORRECTION,
-    L_COUNT,
-    L_DONE,
-    L_ENERGY,
-    L_FORCE,
-    L_REPLACED,
-    L_ROTATION,
-    L_SIGMA,
-    L_SIZE,
-    L_SLACK,
-    L_STEP,
-    N_R,
-    P_FOLLOWED,
-    P_K,
-    P_L,
-    ModalWork,
-    hessian,
-)
+from .fields import ModalWork, hessian
 from .follower import correct_step, follow
 from .host import ModalHost, base_step, hosted, move_base, place_base, put_base
 from .modes import ModalBasis
@@ -80,15 +57,15 @@ def sweep(b: ModalBasis, first_tendon: Ints, command: Floats, work: ModalWork, w
 def add_damping(b: ModalBasis, work: ModalWork) -> None:
     """Add sigma D to the Hessian; and the largest of what bends the modes, in what bends them by a radian."""
     n_modes = b.component.shape[0]
-    clear(work.newton[L_FORCE * W : (L_FORCE + 1) * W])
+    clear(work.newton[fd.L_FORCE * W : (fd.L_FORCE + 1) * W])
     for p in range(work.piece.shape[0]):
         for a in range(n_modes):
             row, gram = p * n_modes + a, 1.0 / (2.0 * b.degree[a] + 1.0)
             for w in range(W):
-                k = gram * read(work.piece[p], P_L, w) * read(work.piece[p], P_K + b.component[a], w)
-                force = abs(read(work.gradient, row, w)) * read(work.piece[p], P_L, w) / k
-                write(work.newton, L_FORCE, w, max(force, read(work.newton, L_FORCE, w)))
-                k *= read(work.newton, L_SIGMA, w)
+                k = gram * read(work.piece[p], fd.P_L, w) * read(work.piece[p], fd.P_K + b.component[a], w)
+                force = abs(read(work.gradient, row, w)) * read(work.piece[p], fd.P_L, w) / k
+                write(work.newton, fd.L_FORCE, w, max(force, read(work.newton, fd.L_FORCE, w)))
+                k *= read(work.newton, fd.L_SIGMA, w)
                 write_at(hessian(work), row, row, w, at(hessian(work), row, row, w) + k)
 
 
@@ -101,15 +78,15 @@ def undamped(sigma: float) -> bool:
 @inline
 def drifts(work: ModalWork, w: int) -> bool:
     """Whether the Newton step is one along what nothing holds."""
-    free = read(work.newton, L_FORCE, w) < UNHELD and read(work.host, G_ON, w) == 0.0
-    return free and read(work.newton, L_SIGMA, w) == LEAST_NEUTRAL
+    free = read(work.newton, fd.L_FORCE, w) < UNHELD and read(work.host, fd.G_ON, w) == 0.0
+    return free and read(work.newton, fd.L_SIGMA, w) == LEAST_NEUTRAL
 
 
 @inline
 def rests(work: ModalWork, w: int, tolerance: float) -> bool:
     """Whether the step was undamped, and smaller than `tolerance` [rad] or along what nothing holds."""
-    small = read(work.newton, L_SIZE, w) * max(1.0, read(work.host, G_LIGHT, w)) < tolerance
-    return undamped(read(work.newton, L_SIGMA, w)) and (small or drifts(work, w))
+    small = read(work.newton, fd.L_SIZE, w) * max(1.0, read(work.host, fd.G_LIGHT, w)) < tolerance
+    return undamped(read(work.newton, fd.L_SIGMA, w)) and (small or drifts(work, w))
 
 
 @kernel
@@ -118,28 +95,28 @@ def measure_step(b: ModalBasis, work: ModalWork, tolerance: float) -> bool:
     LONGEST_STEP, none where the Hessian had a negative pivot or the robot is done. Whether every robot
     `rests` after it: its energy need not be looked at."""
     n_modes, newton, every = b.component.shape[0], work.newton, True
-    clear(newton[L_SIZE * W : (L_SIZE + 1) * W])
+    clear(newton[fd.L_SIZE * W : (fd.L_SIZE + 1) * W])
     for p in range(work.piece.shape[0]):
         for a in range(n_modes):
             row, strain = p * n_modes + a, b.component[a] >= 3
             for w in range(W):
-                unit = 5.0 if strain else read(work.piece[p], P_L, w)
-                size, largest = unit * abs(read(work.gradient, row, w)), read(newton, L_SIZE, w)
-                write(newton, L_SIZE, w, largest if size <= largest else size)  # NaN wins
+                unit = 5.0 if strain else read(work.piece[p], fd.P_L, w)
+                size, largest = unit * abs(read(work.gradient, row, w)), read(newton, fd.L_SIZE, w)
+                write(newton, fd.L_SIZE, w, largest if size <= largest else size)  # NaN wins
     for k in range(6 if hosted(work) else 0):
         for w in range(W):
-            unit = 1.0 / read(work.piece[0], P_L, w) if k < 3 else 1.0
-            size, largest = unit * abs(read(work.host, G_STEP + k, w)), read(newton, L_SIZE, w)
-            write(newton, L_SIZE, w, largest if size <= largest else size)
+            unit = 1.0 / read(work.piece[0], fd.P_L, w) if k < 3 else 1.0
+            size, largest = unit * abs(read(work.host, fd.G_STEP + k, w)), read(newton, fd.L_SIZE, w)
+            write(newton, fd.L_SIZE, w, largest if size <= largest else size)
     for w in range(W):
-        size, done = read(newton, L_SIZE, w), read(newton, L_DONE, w) > 0.0
+        size, done = read(newton, fd.L_SIZE, w), read(newton, fd.L_DONE, w) > 0.0
         if not done:
-            write(newton, L_CORRECTION, w, read(newton, L_FORCE, w) if drifts(work, w) else size)
-            write(newton, L_COUNT, w, read(newton, L_COUNT, w) + 1.0)
+            write(newton, fd.L_CORRECTION, w, read(newton, fd.L_FORCE, w) if drifts(work, w) else size)
+            write(newton, fd.L_COUNT, w, read(newton, fd.L_COUNT, w) + 1.0)
         if not size < 1e300:  # also where it is no number
-            write(newton, L_REPLACED, w, 1.0)
-        replaced = read(newton, L_REPLACED, w) > 0.0
-        write(newton, L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
+            write(newton, fd.L_REPLACED, w, 1.0)
+        replaced = read(newton, fd.L_REPLACED, w) > 0.0
+        write(newton, fd.L_STEP, w, 0.0 if done or replaced else min(1.0, LONGEST_STEP / max(size, 1e-300)))
         every = every and (done or (not replaced and rests(work, w, tolerance)))
     return every
 
@@ -149,12 +126,12 @@ def take_step(work: ModalWork) -> None:
     """q -= the fraction of the step."""
     for a in range(len(work.q) // W):
         for w in range(W):
-            fraction = read(work.newton, L_STEP, w)
+            fraction = read(work.newton, fd.L_STEP, w)
             step = fraction * read(work.gradient, a, w) if fraction > 0.0 else 0.0
             write(work.gradient, a, w, step)
             write(work.q, a, w, read(work.q, a, w) - step)
     if hosted(work):
-        move_base(work, work.newton[L_STEP * W : (L_STEP + 1) * W])
+        move_base(work, work.newton[fd.L_STEP * W : (fd.L_STEP + 1) * W])
 
 
 @inline
@@ -170,7 +147,7 @@ def slack_tendons(work: ModalWork, w: int) -> float:
 def note_slack(work: ModalWork) -> None:
     """Remember which tendons are slack before a step."""
     for w in range(W):
-        write(work.newton, L_SLACK, w, slack_tendons(work, w))
+        write(work.newton, fd.L_SLACK, w, slack_tendons(work, w))
 
 
 @kernel
@@ -179,9 +156,11 @@ def went_slack(work: ModalWork, tolerance: float) -> bool:
     and the error is no longer the square of the step. Looked at again, unless the step was tiny."""
     newton, some = work.newton, False
     for w in range(W):
-        switched = slack_tendons(work, w) != read(newton, L_SLACK, w)
-        again = switched and read(newton, L_DONE, w) == 0.0 and read(newton, L_SIZE, w) > TINY * tolerance
-        write(newton, L_AGAIN, w, 1.0 if again else 0.0)
+        switched = slack_tendons(work, w) != read(newton, fd.L_SLACK, w)
+        again = (
+            switched and read(newton, fd.L_DONE, w) == 0.0 and read(newton, fd.L_SIZE, w) > TINY * tolerance
+        )
+        write(newton, fd.L_AGAIN, w, 1.0 if again else 0.0)
         some = some or again
     return some
 
@@ -194,9 +173,9 @@ def disturb(b: ModalBasis, work: ModalWork, w: int) -> None:
     for p in range(n_pieces):
         for a in range(n_modes):
             if b.component[a] < 3 and b.degree[a] == 0:
-                bend = IMPERFECTION / (n_pieces * read(work.piece[p], P_L, w) * (1.0 + b.component[a]))
+                bend = IMPERFECTION / (n_pieces * read(work.piece[p], fd.P_L, w) * (1.0 + b.component[a]))
                 write(work.q, p * n_modes + a, w, read(work.q, p * n_modes + a, w) + bend)
-    write(work.newton, L_BEFORE, w, 1e300)
+    write(work.newton, fd.L_BEFORE, w, 1e300)
 
 
 @inline
@@ -219,38 +198,43 @@ def accept_step(b: ModalBasis, work: ModalWork, tip: int, tolerance: float, enou
     that is larger."""
     newton, left = work.newton, 0
     for w in range(W):
-        energy, before = read(newton, L_ENERGY, w), read(newton, L_BEFORE, w)
-        turned = rotation_between(get_mat(work.node[-1, tip], N_R, w), get_mat(newton, L_ROTATION, w))
+        energy, before = read(newton, fd.L_ENERGY, w), read(newton, fd.L_BEFORE, w)
+        turned = rotation_between(get_mat(work.node[-1, tip], fd.N_R, w), get_mat(newton, fd.L_ROTATION, w))
         energy -= dot(get(work.outside, 3, w), turned)
-        sigma, size = read(newton, L_SIGMA, w), read(newton, L_SIZE, w)
+        sigma, size = read(newton, fd.L_SIGMA, w), read(newton, fd.L_SIZE, w)
         follower = get(work.outside, 12, w)
         # the energy of a force that follows the rod is not the same after the step
-        small = size * read(newton, L_STEP, w) < 1e-6 or (undamped(sigma) and size < tolerance)
-        followed = dot(follower, follower) > 0.0 or read(work.piece[0], P_FOLLOWED, w) > 0.0
-        small = small or (size < LONGEST_STEP and (followed or read(work.host, G_ON, w) > 0.0))
+        small = size * read(newton, fd.L_STEP, w) < 1e-6 or (undamped(sigma) and size < tolerance)
+        followed = dot(follower, follower) > 0.0 or read(work.piece[0], fd.P_FOLLOWED, w) > 0.0
+        small = small or (size < LONGEST_STEP and (followed or read(work.host, fd.G_ON, w) > 0.0))
         lower = energy <= before + ROUNDING * (abs(before) + abs(energy)) or small
-        if read(newton, L_DONE, w) > 0.0:
+        if read(newton, fd.L_DONE, w) > 0.0:
             continue
-        replaced = read(newton, L_REPLACED, w) > 0.0
+        replaced = read(newton, fd.L_REPLACED, w) > 0.0
         if replaced or not lower:
-            force, more = read(newton, L_FORCE, w), min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
-            write(newton, L_SIGMA, w, NEUTRAL if sigma < LEAST_NEUTRAL and force < NEARLY else more)
+            force, more = read(newton, fd.L_FORCE, w), min(max(8.0 * sigma, FIRST_SIGMA), LARGEST_SIGMA)
+            write(newton, fd.L_SIGMA, w, NEUTRAL if sigma < LEAST_NEUTRAL and force < NEARLY else more)
             for a in range(len(work.q) // W):
                 write(work.q, a, w, read(work.q, a, w) + read(work.gradient, a, w))
             for k in range(6 if hosted(work) else 0):
-                write(work.host, G_D + k, w, read(work.host, G_D + k, w) + read(work.host, G_STEP + k, w))
+                write(
+                    work.host,
+                    fd.G_D + k,
+                    w,
+                    read(work.host, fd.G_D + k, w) + read(work.host, fd.G_STEP + k, w),
+                )
             if replaced and sigma >= LEAST_NEUTRAL and force < STATIONARY:
                 disturb(b, work, w)
             left += 1
             continue
         close = rests(work, w, tolerance)
-        write(newton, L_BEFORE, w, read(newton, L_ENERGY, w))
-        put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
+        write(newton, fd.L_BEFORE, w, read(newton, fd.L_ENERGY, w))
+        put_mat(newton, fd.L_ROTATION, w, get_mat(work.node[-1, tip], fd.N_R, w))
         less = 0.125 * sigma if sigma > SMALLEST_SIGMA else 0.0
         neutral = undamped(sigma) and sigma > 0.0
-        write(newton, L_SIGMA, w, max(0.9 * sigma, LEAST_NEUTRAL) if neutral else less)
-        if enough and close and read(newton, L_AGAIN, w) == 0.0:
-            write(newton, L_DONE, w, 1.0)
+        write(newton, fd.L_SIGMA, w, max(0.9 * sigma, LEAST_NEUTRAL) if neutral else less)
+        if enough and close and read(newton, fd.L_AGAIN, w) == 0.0:
+            write(newton, fd.L_DONE, w, 1.0)
         else:
             left += 1
     return left
@@ -273,17 +257,17 @@ def minimise(
     `most` times. Ends with the shape at q; what a robot did does not depend on its neighbours."""
     newton, tip, known = work.newton, b.width.shape[0], False
     for w in range(W):
-        write(newton, L_SIGMA, w, 0.0)
-        write(newton, L_DONE, w, 0.0)
-        write(newton, L_COUNT, w, 0.0)
+        write(newton, fd.L_SIGMA, w, 0.0)
+        write(newton, fd.L_DONE, w, 0.0)
+        write(newton, fd.L_COUNT, w, 0.0)
     for i in range(most):
         sweep(b, first_tendon, command, work, True)
         note_slack(work)
         on_tip = follow(work)
-        follows = on_tip or work.piece[0, P_FOLLOWED * W] > 0.0
+        follows = on_tip or work.piece[0, fd.P_FOLLOWED * W] > 0.0
         assemble(b, first_tendon, work)
         add_damping(b, work)
-        factor(hessian(work), newton[L_REPLACED * W : (L_REPLACED + 2) * W])
+        factor(hessian(work), newton[fd.L_REPLACED * W : (fd.L_REPLACED + 2) * W])
         forward(hessian(work), work.gradient)
         if hosted(work):
             base_step(robots, host, b, motion, work)
@@ -292,24 +276,24 @@ def minimise(
             correct_step(work)
         small = measure_step(b, work, tolerance)
         if not small and (follows or not known or hosted(work)):
-            energy_of_shape(b, command, work, newton[L_BEFORE * W : (L_BEFORE + 1) * W])
+            energy_of_shape(b, command, work, newton[fd.L_BEFORE * W : (fd.L_BEFORE + 1) * W])
             for w in range(W):
-                put_mat(newton, L_ROTATION, w, get_mat(work.node[-1, tip], N_R, w))
+                put_mat(newton, fd.L_ROTATION, w, get_mat(work.node[-1, tip], fd.N_R, w))
         take_step(work)
         sweep(b, first_tendon, command, work, False)
         known, enough = not small, i + 1 >= least
         again = went_slack(work, tolerance)
         if small and enough and not again:
             for w in range(W):
-                write(newton, L_DONE, w, 1.0)
+                write(newton, fd.L_DONE, w, 1.0)
             return
         if not small:
-            energy_of_shape(b, command, work, newton[L_ENERGY * W : (L_ENERGY + 1) * W])
+            energy_of_shape(b, command, work, newton[fd.L_ENERGY * W : (fd.L_ENERGY + 1) * W])
             if accept_step(b, work, tip, tolerance, enough) == 0:
                 return
         elif enough:
             for w in range(W):
-                write(newton, L_DONE, w, 1.0 - read(newton, L_AGAIN, w))
+                write(newton, fd.L_DONE, w, 1.0 - read(newton, fd.L_AGAIN, w))
     sweep(b, first_tendon, command, work, False)  # a last step may have been undone
 
 
@@ -328,9 +312,9 @@ def hold(
     for w in range(W):
         for a in range(len(work.q) // W):
             write(work.q, a, w, given[robots[w], a])
-        write(work.newton, L_DONE, w, 1.0)
-        write(work.newton, L_COUNT, w, 1.0)
-        write(work.newton, L_CORRECTION, w, 0.0)
+        write(work.newton, fd.L_DONE, w, 1.0)
+        write(work.newton, fd.L_COUNT, w, 1.0)
+        write(work.newton, fd.L_CORRECTION, w, 0.0)
     if hosted(work):
         put_base(robots, given, work)
     sweep(b, first_tendon, command, work, with_forces)

@@ -10,24 +10,9 @@ from ...jit import inline, kernel
 from ...vec import Vec, add, axpy, cross, matmul, scale, sub
 from ..gather import pick, scatter
 from ..lanes import Lanes, W, get, get_mat, put, put_mat, read, write
+from . import fields as fd
 from .balance import balance_of_piece, pass_on, start_at_tip
-from .fields import (
-    B_F,
-    B_M,
-    BEYOND,
-    H_J,
-    N_F,
-    N_POS,
-    N_R,
-    N_T,
-    P_K,
-    P_L,
-    P_RHO,
-    S_F,
-    S_MASS,
-    S_ROW,
-    ModalWork,
-)
+from .fields import ModalWork
 from .gather import ModalBatch, along
 from .host import hosted, show_exchange
 from .modes import ModalBasis
@@ -101,7 +86,7 @@ def place_section(m: int, robots: Ints, samples: ModalSamples, batch: ModalBatch
                 write(at, field, w, read(at, field, w) + value * q[w])
     for n in range(b.node.shape[0]):
         for w in range(W):
-            tangent = axpy(samples.row[m, n], get(node[n], N_T, w), get(at, _PLACE, w))
+            tangent = axpy(samples.row[m, n], get(node[n], fd.N_T, w), get(at, _PLACE, w))
             put(at, _PLACE, w, tangent)
     for w in range(W):
         i = robots[w]
@@ -109,12 +94,12 @@ def place_section(m: int, robots: Ints, samples: ModalSamples, batch: ModalBatch
         put(at, _FIRST, w, add(along(table, samples.place[m, 0]), get(at, _FIRST, w)))
         put(at, _SECOND, w, add(along(table, samples.place[m, 1]), get(at, _SECOND, w)))
     for w in range(W):
-        length, first, second = read(piece, P_L, w), get(at, _FIRST, w), get(at, _SECOND, w)
+        length, first, second = read(piece, fd.P_L, w), get(at, _FIRST, w), get(at, _SECOND, w)
         h = samples.width[m] * length
         o = axpy(MAGNUS * h * h, cross(first, second), scale(0.5 * h, add(first, second)))
         series, _ = exp_series(o)
-        put_mat(at, _ROTATION, w, matmul(get_mat(node[j], N_R, w), rotation_of(o, series)))
-        put(at, _PLACE, w, axpy(length, get(at, _PLACE, w), get(node[0], N_POS, w)))
+        put_mat(at, _ROTATION, w, matmul(get_mat(node[j], fd.N_R, w), rotation_of(o, series)))
+        put(at, _PLACE, w, axpy(length, get(at, _PLACE, w), get(node[0], fd.N_POS, w)))
 
 
 @kernel
@@ -160,21 +145,21 @@ def show_forces(
         for m in range(len(samples.piece)):
             if samples.piece[m] == p:
                 for w in range(n_robots):
-                    force = scale(-1.0, get(work.beyond[0], B_F, w))
+                    force = scale(-1.0, get(work.beyond[0], fd.B_F, w))
                     for k in range(n + 1):
                         beyond = 1.0 - samples.row[m, k] / b.integral[n, k]
-                        force = axpy(-beyond, get(work.node[p, k], N_F, w), force)
+                        force = axpy(-beyond, get(work.node[p, k], fd.N_F, w), force)
                     for k in range(work.station.shape[1]):
                         station = work.station[p, k]
                         # a station's last weight is that of its place
                         if _beyond(station, samples, m, b, w):
-                            force = sub(force, get(station, S_F, w))
+                            force = sub(force, get(station, fd.S_F, w))
                     scatter(shape.force[robots[w], m], force)
         pass_on(p, b, work)
-        for f in range(BEYOND * W):
+        for f in range(fd.BEYOND * W):
             work.beyond[0, f] = work.beyond[1, f]
     for w in range(n_robots):
-        force, moment = get(work.beyond[0], B_F, w), get(work.beyond[0], B_M, w)
+        force, moment = get(work.beyond[0], fd.B_F, w), get(work.beyond[0], fd.B_M, w)
         scatter(shape.base_wrench[robots[w], :3], scale(-1.0, force))
         scatter(shape.base_wrench[robots[w], 3:], scale(-1.0, moment))
 
@@ -184,7 +169,7 @@ def _beyond(station: Lanes, samples: ModalSamples, m: int, b: ModalBasis, w: int
     """A station lies beyond cross-section m: the integrals of 1 to both places, which are their places."""
     there, here = 0.0, 0.0
     for k in range(b.node.shape[0]):
-        there += read(station, S_ROW + k, w)
+        there += read(station, fd.S_ROW + k, w)
         here += samples.row[m, k]
     return there > here
 
@@ -197,19 +182,19 @@ def energies(w: int, i: int, b: ModalBasis, motion: ModalMotion, work: ModalWork
     for p in range(work.piece.shape[0]):
         piece = work.piece[p]
         for k in range(n + 1):
-            at, mass = (p * (n + 1) + k) * NODE_VECTORS, b.integral[n, k] * read(piece, P_L, w)
-            mass *= read(piece, P_RHO, w)
+            at, mass = (p * (n + 1) + k) * NODE_VECTORS, b.integral[n, k] * read(piece, fd.P_L, w)
+            mass *= read(piece, fd.P_RHO, w)
             for f in range(NODE_VECTORS):
-                spin = read(work.history[p, k], H_J + max(f - 3, 0) // 3, w)
+                spin = read(work.history[p, k], fd.H_J + max(f - 3, 0) // 3, w)
                 kinetic += 0.5 * (mass if f < 3 else spin) * motion.velocity[i, at + f] ** 2
         for k in range(n_lumps(motion, work)):
             at = work.piece.shape[0] * (n + 1) * NODE_VECTORS + 3 * (p * n_lumps(motion, work) + k)
             for f in range(3):
-                kinetic += 0.5 * read(work.station[p, k], S_MASS, w) * motion.velocity[i, at + f] ** 2
+                kinetic += 0.5 * read(work.station[p, k], fd.S_MASS, w) * motion.velocity[i, at + f] ** 2
         for a in range(n_modes):
             q = read(work.q, p * n_modes + a, w)
             gram = 0.5 / (2.0 * b.degree[a] + 1.0)
-            strain += gram * read(piece, P_L, w) * read(piece, P_K + b.component[a], w) * q * q
+            strain += gram * read(piece, fd.P_L, w) * read(piece, fd.P_K + b.component[a], w) * q * q
     return kinetic, strain
 
 
@@ -218,8 +203,8 @@ def show_tip(robots: Ints, n_robots: int, b: ModalBasis, work: ModalWork, shape:
     """Pose of the tip."""
     tip = work.node[work.piece.shape[0] - 1, b.width.shape[0]]
     for w in range(n_robots):
-        i, r = robots[w], get_mat(tip, N_R, w)
-        scatter(shape.tip_position[i], get(tip, N_POS, w))
+        i, r = robots[w], get_mat(tip, fd.N_R, w)
+        scatter(shape.tip_position[i], get(tip, fd.N_POS, w))
         for a in range(3):
             scatter(shape.tip_rotation[i, a], (r[3 * a], r[3 * a + 1], r[3 * a + 2]))
 
@@ -275,7 +260,7 @@ def arclength(m: int, w: int, samples: ModalSamples, batch: ModalBatch, work: Mo
     """Arclength of cross-section m [m], without stretch."""
     pieces, before = batch.pieces, 0.0
     for p in range(samples.piece[m]):
-        before += read(work.piece[p], P_L, w)
+        before += read(work.piece[p], fd.P_L, w)
     p = samples.piece[m]
     first, last = pieces.bound[p, 0], pieces.bound[p, 1]
-    return float(before + (samples.place[m, 2] - first) / (last - first) * read(work.piece[p], P_L, w))
+    return float(before + (samples.place[m, 2] - first) / (last - first) * read(work.piece[p], fd.P_L, w))
