@@ -19,7 +19,7 @@ from fastrod.model.robotfile import load_robot
 from report import Row, Section, bench, note_progress, table
 
 KINDS = ("backlash", "friction", "slack", "latency", "none")
-NOISE, RATE, SECONDS = 1e-4, 100.0, 1.5
+NOISE, RATE = 1e-4, 100.0
 FIT = {"segment.1.damping_time": {"sd": 0.005}, "segment.1.line_density": {"sd": 0.1}}
 
 
@@ -31,7 +31,7 @@ def robot(density: float, mass: float, damping: float, effects: tuple[dict[str, 
     return replace(given, segments=(moved,), effects=effects, fit=FIT, sensor={})
 
 
-def sealed(seed: int) -> tuple[str, RunLog]:
+def sealed(seed: int, seconds: float) -> tuple[str, RunLog]:
     """Return what is sealed, and two runs of smooth commands up to 5 Hz with 0.1 mm of noise."""
     rng, kind = np.random.default_rng(seed), KINDS[seed % len(KINDS)]
     offset = float(np.mean(load_robot("prototype").segments[0].tendons[0].offset))
@@ -52,7 +52,7 @@ def sealed(seed: int) -> tuple[str, RunLog]:
         rng.uniform(0.003, 0.009),
         ({"name": kind, **law},) if law else (),
     )
-    t = np.arange(0.0, SECONDS, 1.0 / RATE)
+    t = np.arange(0.0, seconds, 1.0 / RATE)
     runs = []
     for _ in range(2):
         w = 2.0 * np.pi * np.array([0.5, 1.3, 2.9, 5.1])[:, None, None]
@@ -74,7 +74,7 @@ def sealed(seed: int) -> tuple[str, RunLog]:
 def measure(options: Any) -> list[Section]:
     rows: list[Row] = []
     for seed in range(options.first_seed, options.first_seed + (1 if options.quick else options.logs)):
-        (kind, log), begun = sealed(seed), time.process_time()
+        (kind, log), begun = sealed(seed, options.seconds), time.process_time()
         found = identify(log, robot(0.3, 0.02, 0.004), held_out=["other"], dynamics=True)
         names = [effect.name for effect in found.effects]
         right = names[:1] == [kind] if kind != "none" else found.verdict == "none"
@@ -107,4 +107,10 @@ def measure(options: Any) -> list[Section]:
     ]
 
 
-main = bench(__doc__, measure, ("--logs", 10, "sealed logs"), ("--first-seed", 0, "of them"))
+main = bench(
+    __doc__,
+    measure,
+    ("--logs", 10, "sealed logs"),
+    ("--first-seed", 0, "of them"),
+    ("--seconds", 1.5, "of each of their two runs"),
+)

@@ -22,6 +22,7 @@ from fastrod.errors import InputError, LogError
 from fastrod.identification.learned.network import check_network, residual_network
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.clock import MARGIN, clock_offset
+from fastrod.identification.log.motion import beginnings
 from fastrod.identification.log.questions import read, time_question
 from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
@@ -36,6 +37,7 @@ from fastrod.identification.search.motion import DAMPING, INERTIA, damped, fit_m
 from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.revisits import visits
 from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutcome
+from fastrod.identification.search.solve import rms
 from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
 from fastrod.loading import robot_of
 from fastrod.logs.runlog import RunLog, log_of, on_one_clock
@@ -43,6 +45,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.solver.options import Observer, solver_of
 from fastrod.threads import one_blas_thread
+from fastrod.types import Ints
 
 MAX_EFFECTS = 4
 # samples that the search looks at; the operators run over all, and what is found is fitted to all. Few are
@@ -58,6 +61,7 @@ _SPARE = 2
 # of what the best single effect leaves, and of what is left where none is certain or all were found: a robot
 # of other tendons that leaves less is the one to go on with
 _MUCH_LESS, _LESS = 0.8, 0.9
+_ALIKE = 1.2  # what is left of a long log: so many times what is left at its beginning
 MOST_SECONDS = 60.0
 """CPU s of a search: it begins no further stage that would end later if it took as long as the last one; most
 logs take 5."""
@@ -208,12 +212,12 @@ def _on_one_clock(result: Result, robot: Robot, laid: float) -> Result:
     )
 
 
-def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Result:
-    """All that follows from what a search has found, and data held out confirm."""
-    explained = explain(log, base, outcome)
+def _concluded(log: SplitLog, base: BaseFit, outcome: SearchOutcome, whole: bool = False) -> Result:
+    """All that follows from what a search has found, and data held out confirm; `whole` as in `explain`."""
+    explained = explain(log, base, outcome, whole)
     if why := explained.refused(base.noise.floor):
         outcome = _nothing_found(base, outcome, why)
-        explained = explain(log, base, outcome)
+        explained = explain(log, base, outcome, whole)
     remaining = residual_structure(
         base.search.samples,
         base.start.model.wiring,
@@ -262,28 +266,55 @@ def _in_motion(
     progressed: Callable[[str, int, int], None],
     threads: int | None,
 ) -> Result:
-    """Return what the model of `robot` in motion lacks: damping, where its file has none, then effects."""
+    """Return what the model of `robot` in motion lacks: damping, where its file has none, then effects. Of a
+    long log it is found in a beginning, where that does for the rest."""
     most, log = max_effects + _SPARE + 2, log.swings or log
 
-    def fitted(model: Model, robot: Robot) -> BaseFit:
+    def fitted(rows: Ints, model: Model, robot: Robot) -> BaseFit:
         def report(what: str) -> None:
             progressed(what, 0, most)
 
-        return fit_motion(log.samples.on(log.rows), model, robot, excluded, threads=threads, report=report)
+        return fit_motion(log.samples.on(rows), model, robot, excluded, threads=threads, report=report)
 
-    base, without = fitted(model, robot), None
-    if max_effects and not any(s.damping_time for s in robot.segments):
-        moved = damped(robot)
-        other = fitted(
-            base_model(moved, free_camera=free_camera, dynamics=True, sessions=model.sessions), moved
-        )
-        if other.left < _LESS * base.left:
-            base, without = other, base
-    progressed(base.sentence, 0, most)
-    outcome = _searched(base, max_effects, progressed)
-    progressed("prediction on all samples", most - 1, most)
-    result = _concluded(log, base, outcome)
-    return named(result, log, without, base, (DAMPING,)) if without else result
+    for rows in beginnings(log.samples, log.rows):
+        base, without = fitted(rows, model, robot), None
+        if max_effects and not any(s.damping_time for s in robot.segments):
+            moved = damped(robot)
+            other = fitted(
+                rows,
+                base_model(moved, free_camera=free_camera, dynamics=True, sessions=model.sessions),
+                moved,
+            )
+            if other.left < _LESS * base.left:
+                base, without = other, base
+        progressed(base.sentence, 0, most)
+        outcome = _searched(base, max_effects, progressed)
+        for whole in (False, True):  # what was found, fitted to all where a beginning does not do
+            progressed("fit to all samples" if whole else "prediction on all samples", most - 1, most)
+            result = _concluded(log, base, outcome, whole)
+            result = named(result, log, without, base, (DAMPING,)) if without else result
+            if len(rows) == len(log.rows):
+                return result
+            here, later = _left_later(result, rows)
+            if later <= _ALIKE * max(here, result.noise.floor):
+                said = (
+                    f"The search in motion looked at {len(rows)} of {len(log.rows)} rows, the beginnings of "
+                    f"runs{', and the fit at all' if whole else ''}; those leave {1e3 * here:.2g} mm, the "
+                    f"others {1e3 * later:.2g} mm."
+                )
+                return replace(result, notes=[*result.notes, said])
+    return result
+
+
+def _left_later(result: Result, rows: Ints) -> tuple[float, float]:
+    """Distance rms [m] that a result leaves at the rows that were fitted, and at the others that might have
+    been; infinite where the rod is lost."""
+    off = np.linalg.norm(np.asarray(result.log.tip_position) - result.after, axis=1)
+    lost, fitted = result.measured & ~np.isfinite(off), np.isin(np.arange(len(off)), rows)
+    if lost.any():
+        return 0.0, np.inf
+    here, later = (rms(off[result.used & which, None]) for which in (fitted, ~fitted))
+    return here, later
 
 
 def _found(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from fastrod import Modal, Robot, Segment, Simulator, Tendon, save_robot
 from fastrod.commands.cli import main
 from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
+from fastrod.identification.log import motion
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import sample
-from fastrod.identification.log.motion import MotionReplay, let_go
+from fastrod.identification.log.motion import MotionReplay, beginnings, let_go
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.motion import MotionRod, SideBySide
@@ -375,3 +377,30 @@ def test_sessions_have_their_own_zeros_in_motion() -> None:
         zero = found.base_parameters[f"session tuesday.tendon.{number}.zero"]
         assert abs(zero.value - true) < 3.0 * zero.stderr
         assert zero.stderr < 1e-4
+
+
+def test_a_fit_begins_with_seconds_of_some_runs_and_ends_with_all() -> None:
+    t = np.tile(np.arange(3000) * 0.01, 40)
+    dl, run = commands(1, np.maximum(t - 7.0, 0.0)), np.repeat([f"{k}" for k in range(40)], 3000)
+    log = RunLog(name="long", t=t, run=run, dl=dl, tip_position=np.zeros((len(t), 3)))
+    rows = np.flatnonzero(np.arange(len(t)) % 5 > 0)
+    first, *more = beginnings(sample(log), rows)
+    assert len(np.unique(log.run[first])) == 8
+    assert 10.9 < t[first].max() < 11.1  # nothing moves for 7 s
+    assert all(np.isin(a, b).all() and len(a) < len(b) for a, b in pairwise([first, *more]))
+    assert np.array_equal(more[-1], rows)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("slips", [False, True])
+def test_a_beginning_of_a_long_log_is_fitted_where_it_does(slips: bool, monkeypatch: Any) -> None:
+    monkeypatch.setattr(motion, "_BEGIN_S", 0.3)
+    monkeypatch.setattr(motion, "_BEGIN_ROWS", 20)
+    log = recorded(robot(damping=0.006), {"one": 1}, np.arange(120) * 0.01, NOISE, 1e-3)
+    tip = log.tip_position + np.where(slips & (log.t > 0.9), 2e-3, 0.0)[:, None]
+    known = DAMPED | {name: size for name, size in ALL.items() if "al_stiffness" in name}
+    found = identify(replace(log, tip_position=tip), robot(fit=known), dynamics=True, max_effects=0)
+    damping = found.base_parameters["segment.1.damping_time"]
+    assert slips != any("beginnings" in note for note in found.notes)
+    assert slips or abs(damping.value - 0.006) < 4.0 * damping.stderr
+    assert slips or found.test.after < 1.1 * NOISE * np.sqrt(3.0)

@@ -8,7 +8,7 @@ the other. A payload is a mass at the tip here, with its inertia, and not only a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +33,8 @@ _CROSSINGS = 2  # of the pose at rest, from which on a tip swings
 _HELD = 0.1  # of the first displacement: a tip that has gone so far is no longer held
 _HOLDS = 6  # Newton steps to the force that holds the tip
 _STIFF = 0.02  # of the softest direction: along others nothing holds a tip
+_BEGIN_S, _BEGIN_ROWS, _BEGIN_RUNS = 4.0, 100, 8  # of a long log: what is moved at first
+_LONGER = 4  # times so much each time that it does not do
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +143,24 @@ class MotionReplay:
                     "for a whole run: give each its own run."
                 )
         return [float(payload[span.start]) for span in runs]
+
+
+def beginnings(samples: LogSamples, rows: Ints) -> Iterator[Ints]:
+    """Rows to fit in motion, where time goes by how long a run is moved: at first those of some seconds of
+    some runs, from where their inputs begin to change; then more and more, at last all."""
+    inputs, seconds, many = samples.log.inputs, max(_BEGIN_S, _BEGIN_ROWS * samples.step), _BEGIN_RUNS
+    runs = [s for s in samples.runs if ((rows >= s.start) & (rows < s.stop)).any()]
+    starts = [int(np.argmax(np.abs(inputs[s] - inputs[s.start]).any(1))) for s in runs]
+    while True:
+        inside = np.zeros(len(samples.log), bool)
+        for k in np.unique(np.linspace(0, len(runs) - 1, min(many, len(runs))).round().astype(int)):
+            time = samples.time[runs[k]]
+            inside[runs[k]] = time <= time[starts[k]] + seconds
+        if 2 * np.count_nonzero(inside[rows]) > len(rows):
+            break
+        yield rows[inside[rows]]
+        seconds, many = _LONGER * seconds, _LONGER * many
+    yield rows
 
 
 def let_go(log: RunLog) -> RunLog:

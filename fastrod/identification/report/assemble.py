@@ -102,13 +102,14 @@ class Explained:
         return "data held out do not gain what the fitted ones do" if in_vain else ""
 
 
-def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome) -> Explained:
-    """The base model and what was found beside it, predicted on every sample of a log."""
+def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome, whole: bool = False) -> Explained:
+    """The base model and what was found beside it, predicted on every sample of a log; in motion fitted to
+    the `whole` of it, or as the search has left it."""
     search, state, names = outcome.search, outcome.state, outcome.names
     samples, rows = log.samples, thinned(log.rows, ALL_AT_ONCE)
-    # each row of a rod of modes costs much more, and the search saw enough of them; in motion it saw all
+    # each row of a rod of modes, or in motion, costs much more, and the search saw enough of them
     if search.rod.of_modes or search.in_motion:
-        rows = search.samples.rows
+        rows = log.rows if whole else search.samples.rows
     start = outcome.start
     seen_all = search.in_motion or not (names and _flags_moved(search, state, base))
     if len(rows) > len(search.samples.rows) or not seen_all:
@@ -584,8 +585,9 @@ def tips_of(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
 def _tips(model: Model, theta: Floats, samples: LogSamples, base: BaseFit) -> Floats:
     """The same of a model at `theta` (p,)."""
     tip = np.full((len(samples.log), 3), np.nan)
-    for start in range(0, len(tip), ALL_AT_ONCE):
-        rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
+    most = max(len(tip), 1) if base.search.in_motion else ALL_AT_ONCE  # in motion rows need those before them
+    for start in range(0, len(tip), most):
+        rows = np.arange(start, min(start + most, len(tip)))
         pose = base.search.predict(model, theta, samples.on(rows))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip

@@ -16,7 +16,7 @@ from fastrod.identification.log.questions import further_than_still
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, target_of
 from fastrod.identification.search.model_selection import ModelState
-from fastrod.identification.search.search import N_BLOCKS, Search
+from fastrod.identification.search.search import Search, blocks_of
 from fastrod.identification.search.solve import Estimate, covariance_of, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
@@ -128,12 +128,12 @@ def fit_base(
 
 def _search(samples: LogSamples, robot: Robot, excluded: frozenset[str], threads: int | None) -> Search:
     """Samples, rod and blocks, all rows weighed by a thousandth of the robot's length."""
-    points, n = samples.log.points is not None, len(samples.rows)
+    points = samples.log.points is not None
     return Search(
         samples,
         PredictedRod(samples, robot, points=points, threads=threads),
         target_of(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=ANGLE, points=points),
-        np.minimum(np.arange(n) * N_BLOCKS // n, N_BLOCKS - 1),
+        blocks_of(len(samples.rows)),
         excluded,
     )
 
@@ -141,11 +141,12 @@ def _search(samples: LogSamples, robot: Robot, excluded: frozenset[str], threads
 def search_on(samples: LogSamples, base: BaseFit, sigma: Floats, state: ModelState) -> Search:
     """The search at other samples of the same robot, weighed by `sigma` (3,) [m]; outliers by the residual
     that `state` leaves: an abrupt effect is none once it is in the model."""
-    search = _search(samples, base.robot, base.search.excluded, base.search.rod.threads)
-    pose = predict(state.model, state.theta, samples, search.rod)
-    good = keep(samples, np.nan_to_num(search.target.tip - pose.position), base.noise) & pose.ok
-    target = replace(search.target, weight=good.astype(float)).weighed(sigma, base.noise.sigma)
-    correlation = base.noise.row_correlation(samples)
+    search, at = base.search.at(samples, base.robot), (state.model, state.theta, samples)
+    target = target_of(samples, sigma, rotation_sigma=ANGLE, points=search.rod.points)
+    pose = search.predict(*at) if search.in_motion else predict(*at, search.rod)
+    good = keep(samples, np.nan_to_num(target.tip - pose.position), base.noise) & pose.ok
+    target = replace(target, weight=good.astype(float)).weighed(sigma, base.noise.sigma)
+    correlation = search.row_correlation if search.in_motion else base.noise.row_correlation(samples)
     return replace(search, target=target, noise=base.noise.sigma, row_correlation=correlation)
 
 

@@ -29,7 +29,7 @@ from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.base import SEEN, BaseFit
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, Target, target_of
 from fastrod.identification.search.model_selection import Candidate, ModelState, unfitted
-from fastrod.identification.search.search import N_BLOCKS, Search, starts_of
+from fastrod.identification.search.search import Search, blocks_of, starts_of
 from fastrod.identification.search.solve import Estimate, Fit, minimise, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
@@ -144,13 +144,20 @@ class MotionRod:
     """Passes of a row beyond which nothing new is tried: in motion only time counts."""
     of_modes: ClassVar[bool] = False
     _known: dict[str, PredictedPose] = field(default_factory=dict)
+    _elsewhere: MotionRod | None = None
 
     def __post_init__(self) -> None:
         self.side_by_side = SideBySide(self._move)
 
     def at(self, samples: LogSamples, longest_step: float | None = None) -> MotionRod:
-        """The same at other samples, or in other steps."""
-        return MotionRod(samples, self.points, self.threads, longest_step or self.longest_step)
+        """The same at other samples, or in other steps: the last such, where it was of these."""
+        step = longest_step or self.longest_step
+        for one in (self, self._elsewhere):
+            same = one and one.longest_step == step and one.samples.log is samples.log
+            if one and same and np.array_equal(one.samples.rows, samples.rows):
+                return one
+        self._elsewhere = MotionRod(samples, self.points, self.threads, step)
+        return self._elsewhere
 
     def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
         """Return what the camera sees of each of these robots, as it is in every session."""
@@ -318,6 +325,10 @@ class MotionSearch(Search):
         """Return what the camera sees at the rows of `samples`."""
         return self.rod.at(samples).poses([model.in_sessions(theta)])[0]
 
+    def at(self, samples: LogSamples, _: Robot) -> Search:
+        """The same at other samples of the robot, weighed as here; its target stays that of these."""
+        return replace(self, samples=samples, rod=self.rod.at(samples), block=blocks_of(len(samples.rows)))
+
     def weighed(self, state: ModelState, noise: Floats) -> tuple[Search, ModelState]:
         """The state fitted again with weights of the size of its own residual, never below the `noise` (3,)
         [m], and the search with these."""
@@ -461,9 +472,7 @@ def fit_motion(
     out = int((own.weight == 0.0).sum())
     notes = (f"{out} of {len(samples.rows)} rows are outliers and do not count",) if out else ()
     whole.runs += solves
-    n = len(samples.rows)
-    blocks = np.minimum(np.arange(n) * N_BLOCKS // n, N_BLOCKS - 1)
-    moved = MotionSearch(samples, whole, own, blocks, excluded, noise.sigma)
+    moved = MotionSearch(samples, whole, own, blocks_of(len(samples.rows)), excluded, noise.sigma)
     search, state = moved.weighed(moved._state(model, moved._near(model, theta), fit, ()), noise.sigma)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=notes)
 
@@ -517,12 +526,12 @@ def _noise(samples: LogSamples, robot: Robot, left: Floats) -> Noise:
 
 
 def _begun(samples: LogSamples, fraction: float) -> Flags:
-    """(n_rows,) rows in the first `fraction` of their run."""
-    inside = np.zeros(len(samples.rows), bool)
+    """(n_rows,) rows in the first `fraction` of what is looked at of their run."""
+    rows, inside = samples.rows, np.zeros(len(samples.rows), bool)
     for span in samples.runs:
-        end = fraction * samples.time[span.stop - 1]
-        mine = (samples.rows >= span.start) & (samples.rows < span.stop)
-        inside |= mine & (samples.time[samples.rows] <= end)
+        mine = (rows >= span.start) & (rows < span.stop)
+        end = fraction * samples.time[rows[mine]].max(initial=0.0)
+        inside |= mine & (samples.time[rows] <= end)
     return inside
 
 

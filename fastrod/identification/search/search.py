@@ -89,6 +89,11 @@ _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
 _ALTERNATIVE_SD = 30.0
 
 
+def blocks_of(n_rows: int) -> Ints:
+    """(n_rows,) number of each row's block, 0 to N_BLOCKS - 1."""
+    return np.asarray(np.minimum(np.arange(n_rows) * N_BLOCKS // n_rows, N_BLOCKS - 1))
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
     """Samples, weights and blocks that all candidates share."""
@@ -110,6 +115,11 @@ class Search:
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
         """Return what the camera sees at the rows of `samples`, solved exactly."""
         return predict(model, theta, samples, PredictedRod(samples, model.robot, threads=self.rod.threads))
+
+    def at(self, samples: LogSamples, robot: Robot) -> Search:
+        """The same at other samples of the robot, weighed as here; its target stays that of these."""
+        rod = PredictedRod(samples, robot, points=self.rod.points, threads=self.rod.threads)
+        return replace(self, samples=samples, rod=rod, block=blocks_of(len(samples.rows)))
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
