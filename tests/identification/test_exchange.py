@@ -78,6 +78,7 @@ def test_a_rival_is_one_beside_all_that_was_found() -> None:
     assert "backlash" not in again.rivals
 
 
+@pytest.mark.study
 def test_each_effect_is_laid_beside_the_base_model_from_where_it_was_found() -> None:
     """Alone each takes something away, whatever its own starts would lead to."""
     search, base, state = searched("stiffness_taper")

@@ -311,6 +311,7 @@ def test_robots_that_forces_drive_are_moved_together_whatever_their_stiffness() 
     assert np.abs(together[0].position - together[1].position).max() > 1e-6
 
 
+@pytest.mark.study
 def test_what_rest_shows_is_fitted_at_rest() -> None:
     """Stretch and a lump's mass, from tips at rest: neither needs a time step."""
     plant, commanded = robot(**TRUE), 1.5 * commands(1, np.arange(80) * 0.025)

@@ -218,7 +218,7 @@ def test_what_a_slow_camera_repeats_is_known_from_a_robot_that_stands_still(law:
         assert sentences(seen)[0].startswith(f"{420 - 420 // every} of 420 rows repeat the measured tip")
 
 
-@pytest.mark.study(beyond=2)
+@pytest.mark.study(beyond=1)
 @pytest.mark.parametrize(  # rows a picture, and what stands in rows between
     ("every", "between"), [(1.09, "the last"), (4.7, "lines"), (1.6, "nothing"), (3.3, "the last")]
 )
