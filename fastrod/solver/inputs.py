@@ -145,6 +145,9 @@ class Reader:
         # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per
         # segment is no shape.
         self._slack: Floats = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
+        self._ends: Floats = np.cumsum(params.length, axis=1)[:, layout.tendon_segment]  # not extended
+        low, high = rest.extension_range[..., 0], rest.extension_range[..., 1]
+        self._may_rest = bool(((low <= 1e-12) & (high >= -1e-12)).all())
         self.problems: dict[int, str] = {}
         self.loads: tuple[Floats, Floats] = (np.zeros((1, 0)), np.zeros((1, 0, 3)))
         """Point forces of the last ports: arclength (n, m) [m] and force (n, m, 3) world [N]."""
@@ -160,7 +163,8 @@ class Reader:
         given_tension = np.ones(n_tendons, bool)
         given_tension[layout.row_tendon] = False  # those of tendon_tension segments remain
         stretch = self._optional("extension", given.extension, (n_segments,), "m")
-        self._check_extension(stretch)
+        if given.extension is not None or not self._may_rest:
+            self._check_extension(stretch)
         self.gravity, self._weight = None, rest.weight
         if given.gravity is not None:
             self.gravity = self._array("gravity", given.gravity, (3,), "m/s^2")
@@ -272,7 +276,9 @@ class Reader:
                 )
             return np.zeros((1, n_tendons))
         lengths = self._array("tendon_length", tendon_length, (n_tendons,), "m")
-        ends = np.cumsum(params.length + stretch, axis=1)[:, layout.tendon_segment]
+        ends = self._ends
+        if stretch.any():
+            ends = np.cumsum(params.length + stretch, axis=1)[:, layout.tendon_segment]
         slack, rows = self._slack, layout.row_tendon
         with np.errstate(invalid="ignore"):
             longer = lengths - ends

@@ -26,6 +26,7 @@ from fastrod.solver.tape import Event, Tape, copied_acting
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 _TOLERANCE = 1e-9  # m: of the rest from which a motion starts
+_PASSES = Bound(least=1, most=100)
 
 
 class ModalMemory(NamedTuple):
@@ -91,7 +92,7 @@ class ModalRods:
             return
         if how.estimate_error and not self.dynamics:
             raise InputError("estimate_error is of steps in time; give Simulator(robot, dynamics=True).")
-        check_number("passes", how.passes, Bound(least=1, most=100), whole=True)
+        check_number("passes", how.passes, _PASSES, whole=True)
         errors = np.full(self.n_robots, np.nan) if how.estimate_error else None
         host = None if how.inverse_inertia is None else self._freed(how.inverse_inertia, errors is not None)
         self._errors, self._host = errors, host

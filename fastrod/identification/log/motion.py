@@ -27,6 +27,7 @@ LONGEST_STEP = 1e-3
 """s. Generalized-alpha is second order: of smooth commands up to 5 Hz it leaves some micrometres."""
 _ON_STEP = 1e-3  # of a step: a sample so near to one needs no interpolation
 _MOST_STEPS = 2_000_000  # of a run
+_AT_ONCE = 256  # steps whose inputs are laid out together
 _FEW = 20  # rows, of which no run is called let go
 _SWINGS = 6.0  # times what the tip still moves at a run's end: a start that is as far away is no rest
 _CROSSINGS = 2  # of the pose at rest, from which on a tip swings
@@ -83,9 +84,9 @@ class MotionReplay:
         kept = np.zeros((len(clock.wanted), len(rods)), bool)
         last = int(clock.wanted[-1])
         for step in range(last + 1):
-            now: dict[str, Any] = {
-                name: np.tile(a, (len(robots), *[1] * (a.ndim - 1))) for name, a in clock.at(step, given)
-            }
+            if step % _AT_ONCE == 0:
+                ahead = clock.inputs(step, given, len(robots))
+            now: dict[str, Any] = {name: a[step % _AT_ONCE] for name, a in ahead}
             state = sim.step(**now) if step else _held(sim, sim.settle(**now), held, now)
             alive &= state.ok
             if step == clock.wanted[len(seen)]:
@@ -260,15 +261,16 @@ class _Clock:
     weight: Floats
     """(n_runs, n_steps) of the sample after it."""
 
-    def at(self, step: int, given: Mapping[str, Floats]) -> list[tuple[str, Floats]]:
-        """The inputs at a step, (n_runs, ...) each."""
-        left, made = self.left[:, step], []
+    def inputs(self, first: int, given: Mapping[str, Floats], n_robots: int) -> list[tuple[str, Floats]]:
+        """The inputs at the steps from this one on, (_AT_ONCE, n_robots * n_runs, ...) each."""
+        left, weight = (a[:, first : first + _AT_ONCE].T for a in (self.left, self.weight))
+        made = []
         for name, array in given.items():
-            w = self.weight[:, step].reshape(-1, *[1] * (array.ndim - 1))
+            w = weight.reshape(*weight.shape, *[1] * (array.ndim - 1))
             value = (1.0 - w) * array[left] + w * array[np.minimum(left + 1, len(array) - 1)]
             if name == "base_pose":
-                value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
-            made.append((name, value))
+                value[..., 3:] /= np.linalg.norm(value[..., 3:], axis=-1, keepdims=True)
+            made.append((name, np.tile(value, (1, n_robots, *[1] * (array.ndim - 1)))))
         return made
 
 
