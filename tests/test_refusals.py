@@ -124,6 +124,7 @@ INPUTS: Rows = [
     (lambda: settle(tendon_length=[-0.07] * 4), "impossible"),
     (lambda: three().step(), "tendon_length is missing"),
     (lambda: settle(LENGTHS, tip_force=[1.0, 2.0]), r"tip_force has shape \(2,\)"),
+    (lambda: settle(LENGTHS, extension=[0.01]), "outside the range"),
     (lambda: settle(LENGTHS, point_force=[(0.1, (0, 0, 1))]), "the rod runs from 0 to 0.07"),
     (lambda: settle(LENGTHS, point_force=[0.1, 0.2]), "pairs"),
     (lambda: settle(LENGTHS, base_pose=[0, 0, 0, 1, 1, 0, 0]), "norm"),
@@ -131,10 +132,12 @@ INPUTS: Rows = [
     (lambda: settle(LENGTHS, line_force=np.zeros((2, 5, 3, 2))), "line_force has shape"),
     (lambda: settle(LENGTHS, line_force=np.zeros((1, 1, 3))), "two or more"),
     (lambda: settle(LENGTHS, tension=[1.0] * 4), "no segment of this robot"),
+    (lambda: three().settle(REST, tolerance=HUGE), r"tolerance is 1000.* m; it must be a number"),
     (
         lambda: step(tip_force=(0.0, 0.0, 1e13)),
         r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 1\.e\+13\]\.",
     ),
+    (lambda: step(tip_force=[HUGE, 0, 0]), "tip_force is not an array of numbers"),
     (lambda: step(point_force=[(HUGE, (0, 0, 1))]), "point_force must be"),
     (lambda: reacher().restore("x"), r"^the snapshot is 'x'; give what Simulator.snapshot\(\) returned"),
     (lambda: reacher().step(dt=0.1), r"^step has no input 'dt'; the time step is given once: Simulator\("),
@@ -168,6 +171,7 @@ INPUTS: Rows = [
 
 SIMULATORS: Rows = [
     (lambda: Simulator(rod(), n_robots=0), "n_robots is 0"),
+    (lambda: Simulator(rod(), n_robots=2.5), "whole number"),
     (lambda: Simulator(rod(), n_robots=HUGE), "take fewer"),
     (lambda: Simulator(rod(), points_per_segment=1), "at least 2"),
     (lambda: Simulator(rod(), outputs="tips"), "'full' or 'tip'"),
@@ -247,6 +251,7 @@ MOTION: Rows = [
     ),
     (lambda: moving(scheme="bdf3"), "^scheme is 'bdf3'; did you mean 'bdf2'"),
     (lambda: Modal(dynamics=True, rho=1), "^rho is 1; it must be a number from 0 to 0.9. Beyond it"),
+    (lambda: moving(dt=0.0), "^dt is 0.0 s; it must be a number, positive and finite"),
     (lambda: moving(dynamics=False, scheme="bdf2"), "^scheme is 'bdf2' without dynamics, and nothing moves"),
     (lambda: Modal(rho=0.8), "^rho is 0.8 without dynamics"),
     (lambda: Modal(modes=(4, 2)), r"^modes is \(4, 2\); give fastrod.Modes\(bending=4, torsion=2\)"),
@@ -301,6 +306,7 @@ ROBOTS: Rows = [
     (lambda: loads(A + 'mode = "passive"\n[base]\nquaternion = [1, 1, 0, 0]'), "it must be 1"),
     (lambda: loads("name = "), "not TOML"),
     (lambda: Simulator("prototype"), "load_robot"),
+    (lambda: Simulator(None), "load_robot"),
     (lambda: Simulator([]), "load_robot"),
     (lambda: Simulator([rod(n_tendons=3), rod(n_tendons=4)]), "n_tendons 4, robot 0 has 3"),
     (lambda: Simulator([rod(), rod("tendon_tension")]), "modes"),
@@ -370,6 +376,10 @@ OTHERS: Rows = [
     (
         lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]),
         "a ray has .* a direction of length 0",
+    ),
+    (
+        lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], longest=0.0),
+        "longest is 0.0 m; it must be a number, positive",
     ),
     (lambda: touching().state.contacts.in_contact("bal"), "no obstacle 'bal'; did you mean 'ball'"),
     (
