@@ -7,7 +7,6 @@ found effect by effect; those that are needed, on every sample; what still remai
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -62,9 +61,9 @@ _SPARE = 2
 # of other tendons that leaves less is the one to go on with
 _MUCH_LESS, _LESS = 0.8, 0.9
 _ALIKE = 1.2  # what is left of a long log: so many times what is left at its beginning
-MOST_SECONDS = 60.0
-"""CPU s of a search: it begins no further stage that would end later if it took as long as the last one; most
-logs take 5."""
+MOST_WORK = 2e7
+"""Passes of a segment (`Work`) in a search: it begins no further stage that would end later if it took as
+many as the last one. Most logs take a tenth; all of it is one to three CPU minutes."""
 _MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
@@ -96,7 +95,7 @@ def identify(
     Zeros of the drives, registration and delay are of a session, where the log names several, and all else is
     shared. With `only_session` they alone are fitted: a robot that was identified before, on another day; no
     effect is tried.
-    Deterministic, unless the search stops by time (`MOST_SECONDS`), as a note then says.
+    Deterministic. A search that takes too long stops by work that is counted (`MOST_WORK`), as a note says.
     Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
     check_number("max_effects", max_effects, NOT_NEGATIVE, whole=True)
@@ -344,7 +343,7 @@ def _found(
             log, base = other_tendons(base, _MUCH_LESS * base.left)
         if base.without is None:
             raise
-    begun = time.process_time()
+    begun = base.search.rod.work.passes
     # beside the best single effect, which may be all; then beside all that were found
     first = _first(base, progressed, most) if max_effects and base.without is None else None
     if first and are_worth_trying(base, left := _left(base, first)) and are_pulled(base):
@@ -389,16 +388,16 @@ def _candidates(
     first: tuple[SearchStep, float] | None = None,
 ) -> SearchOutcome:
     """Effects and alternative patterns that explain the residual of the base model, in the order in which
-    they were found; the `first` stage may be known, with when it was begun [CPU s]."""
+    they were found; the `first` stage may be known, the work done before it."""
     most = max_effects + _SPARE
     search, state, known = base.search, base.start, base.start.model.effects
-    names, steps, notes, begun = list[str](), list[SearchStep](), list[str](), time.process_time()
-    step, begun = first or (None, begun)
-    last = 0.0
+    names, steps, notes, last = list[str](), list[SearchStep](), list[str](), 0.0
+    step, begun = first or (None, search.rod.work.passes)
     for stage in range(most + _MORE_STAGES if max_effects else 0):
-        taken = time.process_time() - begun
-        if stage and taken + (taken - last) > MOST_SECONDS:
-            notes.append(_stopped(stage, taken))
+        taken = search.rod.work.passes - begun
+        if stage and taken + (taken - last) > MOST_WORK:
+            said = "what comes beside what it found was not tried"
+            notes.append(f"the search took too long and stopped after stage {stage}: {said}")
             break
         last = taken if stage else 0.0
 
@@ -437,26 +436,17 @@ def _nothing_found(base: BaseFit, outcome: SearchOutcome, why: str) -> SearchOut
     return replace(outcome, search=base.search, last=start, state=start, names=(), steps=(none,))
 
 
-def _stopped(stages: int, seconds: float) -> str:
-    """That a search has no time left, and what it has not tried."""
-    tried = "1 effect or pattern was" if stages == 1 else f"{stages} effects or patterns were"
-    return (
-        f"the search stopped by time: {tried} found in {seconds:.0f} CPU s, and what comes beside them was "
-        "not tried"
-    )
-
-
 def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> SearchOutcome:
     """The effects that are needed once alternative patterns are gone, with their state."""
     search, state, found, steps = all_found.search, all_found.last, [*all_found.names], [*all_found.steps]
-    alone, suspected, begun = base.start, list[str](), time.process_time()
+    alone, suspected, begun = base.start, list[str](), search.rod.work.passes
     if found:
         alone = search.bare(state) if state.alternatives else state
         noise = base.start.fit.residual.size * float((base.noise.sigma**2).mean())
         while (
             state.alternatives
             and len(found) < max_effects
-            and time.process_time() - begun < 0.5 * MOST_SECONDS
+            and search.rod.work.passes - begun < 0.5 * MOST_WORK
             and alone.fit.loss * float((search.target.sigma**2).mean()) > 2.0 * noise
         ):
             step = search.stage(alone, with_alternatives=False)
@@ -497,8 +487,8 @@ def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> Search
 
 
 def _pair(search: Search, state: ModelState, step: SearchStep, begun: float) -> SearchStep | None:
-    """Two effects at once, where none passes alone: of the five that come nearest, and as many pairs as the
-    search that has `begun` [CPU s] has time for."""
+    """Two effects at once, where none passes alone: of the five that come nearest, and as many pairs as a
+    search may try that has `begun` after so much work."""
     near = sorted(
         (c for c in step.candidates if c.state is not None and c.alternative is None and c.fraction > 0.01),
         key=lambda c: -c.fraction,
@@ -507,7 +497,7 @@ def _pair(search: Search, state: ModelState, step: SearchStep, begun: float) -> 
     for i, one in enumerate(near):
         for other in near[i + 1 :]:
             assert one.state is not None
-            if time.process_time() - begun > MOST_SECONDS:
+            if search.rod.work.passes - begun > MOST_WORK:
                 break
             both = search.candidate(one.state, other.name)
             if both.state is None:

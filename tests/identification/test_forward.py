@@ -19,7 +19,16 @@ from fastrod.effects.executor import reads_bend
 from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
+from fastrod.identification.log.forward import (
+    N_STEPS,
+    LogSamples,
+    PredictedPose,
+    PredictedRod,
+    effects_at,
+    predict,
+    prepare_log,
+    sample,
+)
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route
@@ -205,6 +214,30 @@ def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
     model = base_model(robot)
     some = predict(model, model.start, samples, PredictedRod(samples, robot, points=True))
     assert_alike(some, PredictedPose(*(a[samples.rows] for a in whole)), robot.length)
+
+
+@pytest.mark.parametrize("name", [n for n in TABLES if has_memory(get_effect(n)) and n != "capstan_friction"])
+def test_memories_do_not_miss_what_the_short_samples_leave_out(name: str) -> None:
+    """A log of 500 Hz at 40 of its rows, against every sample of it; laws that drag a bend along are of the
+    first order in the step, which is 1 % of the largest command."""
+    robot = two_segments()
+    whole = sample(log_of(robot, wave(robot, 5000, dt=0.002), dt=0.002))
+    few = whole.on(np.arange(60, 5000, 123))
+    assert len(few.short.time) < 0.6 * len(whole.time)
+    assert few.short.dt.sum() == pytest.approx(whole.dt.sum(), rel=1e-12)
+    assert_array_equal(few.short.time[few.short.rows], whole.time[few.rows])
+    model = base_model(made := having(robot, {"name": name} | TABLES[name]))
+    links = effects_at(model, model.start)
+
+    def driven(samples: LogSamples) -> Floats:
+        opened = prepare_log(samples, made, route(made)).drive(links)
+        return np.column_stack([opened.tendon_length, opened.rest_bend.reshape(len(samples.rows), -1)])
+
+    every, some = driven(whole)[few.rows], driven(few)
+    off = every - np.column_stack(
+        [whole.log.pulls[few.rows] + robot.rest_tendon_length, np.zeros((len(some), 4))]
+    )
+    assert np.abs(some - every).max() < 0.03 * np.abs(off).max()
 
 
 def test_rows_without_a_tip_are_driven_and_rows_without_an_input_are_not_there() -> None:

@@ -168,9 +168,9 @@ def test_slopes_of_the_base_parameters() -> None:
 @pytest.mark.parametrize("name", [*TENDONS, *CAMERA, *FORCE, *MEMORY])
 def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
-    before = here.rod.runs
+    before = here.rod.work.batches
     here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
-    assert here.rod.runs - before <= 4 + 3  # at most what `by_length` and `by_force` took, once
+    assert here.rod.work.batches - before <= 4 + 3  # at most what `by_length` and `by_force` took, once
     assert_slopes(here, model, theta, first, TENDONS | CAMERA | FORCE | MEMORY)
 
 

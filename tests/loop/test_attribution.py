@@ -93,10 +93,9 @@ OTHERS = {"drum_gain": 1008, "gravity": 1027, "precurvature": 1012, "tendon_stre
 
 @pytest.mark.study
 @pytest.mark.parametrize(("name", "seed"), OTHERS.items())
-def test_on_another_robot_an_effect_is_named_with_its_numbers(name: str, seed: int, monkeypatch: Any) -> None:
+def test_on_another_robot_an_effect_is_named_with_its_numbers(name: str, seed: int) -> None:
     """Where slopes lead far off, the rod is solved again there; drives that are alike have one number; a
     stiffness that stands in for a stretch is forgotten where the stretch is tried."""
-    monkeypatch.setattr("fastrod.identification.attribution.MOST_SECONDS", 1e3)  # they go by the machine
     log, other, hidden = other_robots.sealed(seed, name)
     result = identify(log, other, threads=1)
     assert [effect.name for effect in result.effects] == [name]

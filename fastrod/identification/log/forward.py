@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import cached_property
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,9 +53,14 @@ _FINE = 2e-3  # of steps of slopes and of the tolerance, where tendons can go sl
 # passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some
 # hundreds of them)
 _LOST = 500
+# passes of a segment that take as long: 50 samples on which effects act one, an evaluation without a rod 200
+# beside these, a step of a batch in motion 60
+_SAMPLES, _EVALUATION, _STEP = 50, 200, 60
 _ROUGH = 1e-5, 1e-3  # of the length; rad
 _BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
 _SOON = 10.0  # s
+_FEW = 2000  # rows, beside which memories may take long
+_APART, _MOVED, _STRAIGHT = 0.02, 0.01, 1e-4  # s; of the largest command
 _GAP = 3.0  # times the usual time between two rows of a run
 _FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
@@ -115,6 +121,42 @@ class LogSamples:
     def on(self, rows: Ints) -> LogSamples:
         """The same samples, compared at other rows."""
         return replace(self, rows=rows)
+
+    @cached_property
+    def short(self) -> LogSamples:
+        """The same without samples that no memory misses, where few rows are compared: samples between two
+        that are hardly apart in time and commands, which go straight from one to the other. A log of 500 Hz
+        is a quarter of itself so, or less; one of 50 Hz stays as it is."""
+        if self.step >= _APART or not 0 < len(self.rows) < min(_FEW, len(self.time) // 2):
+            return self
+        dl = self.log.pulls
+        path = np.cumsum(np.abs(np.diff(dl, axis=0, prepend=dl[:1])).max(1)) / np.abs(dl).max()
+        every = np.floor(self.time / _APART) + np.floor(path / _MOVED)
+        kept = np.diff(every, prepend=np.nan) != 0.0
+        kept[self.rows] = True
+        for span in self.runs:
+            kept[[span.start, span.stop - 1]] = True
+        straight = _STRAIGHT * np.abs(dl).max(initial=0.0)
+        while True:
+            bent = np.zeros(len(kept), bool)
+            for s, column in product(self.runs, dl.T):
+                between = np.interp(self.time[s], self.time[s][kept[s]], column[s][kept[s]])
+                bent[s] |= ~kept[s] & (np.abs(between - column[s]) > straight)
+            if not bent.any():
+                break
+            kept |= bent
+        some = np.flatnonzero(kept)
+        spans = (np.searchsorted(some, [span.start, span.stop]).tolist() for span in self.runs)
+        return replace(
+            self,
+            log=self.log.rows(some),
+            origin=self.origin[some],
+            rows=np.searchsorted(some, self.rows),
+            runs=tuple(slice(*ends) for ends in spans),
+            time=self.time[some],
+            dt=np.diff(np.cumsum(self.dt)[some], prepend=0.0),
+            session=self.session[some],
+        )
 
 
 def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
@@ -202,6 +244,32 @@ class RodAnswer(NamedTuple):
     """(n, n_segments, 2) [rad]"""
 
 
+@dataclass
+class Work:
+    """Work done so far, counted: seconds go by the machine, and what is found must not."""
+
+    batches: int = 0
+    """Solved, or moved."""
+    of_row: float = 0.0
+    """Passes of a row at rest, on the average."""
+    passes: float = 0.0
+    """Of one segment, all rows together, and what takes as long; 4 to 9 us of CPU time each."""
+
+    def rows(self, passes: Ints, n_segments: int) -> None:
+        """Count a batch solved in so many `passes` (n_rows,) each."""
+        self.batches, self.of_row = self.batches + 1, self.of_row + float(passes.mean())
+        self.passes += float(passes.sum()) * n_segments
+
+    def samples(self, n: int) -> None:
+        """Count an evaluation without a rod whose effects act on `n` samples, each on its own."""
+        self.passes += _EVALUATION + n / _SAMPLES
+
+    def steps(self, n: int, n_segments: int) -> None:
+        """Count `n` steps in motion of rods with `n_segments` together."""
+        self.batches += 1
+        self.passes += n * (_STEP + n_segments)
+
+
 class PredictedRod:
     """The batch that solves the rows of `samples`; it stays warm from one parameter vector to the next."""
 
@@ -230,10 +298,7 @@ class PredictedRod:
         self._tolerance = self.fine * TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
         self.answer = RodAnswer(np.zeros((n, robot.n_tendons)), np.zeros((n, robot.n_segments, 2)))
-        self.runs = 0
-        """Batches solved so far."""
-        self.cost = 0.0
-        """Passes of a row so far, on the average."""
+        self.work = Work()
 
     def solve(
         self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None, near: bool = False
@@ -241,7 +306,6 @@ class PredictedRod:
         """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is given.
         `near` ones differ so little from the last that a difference of first order is all that counts; where
         tendons can go slack they are solved, too."""
-        self.runs += 1
         first_order = near and self.of_modes and not self._one_sided
         state = self._sim.settle_ports(
             ports,
@@ -250,7 +314,7 @@ class PredictedRod:
             None if rows is None or rows.all() else np.flatnonzero(rows),
             replace(robot, effects=()),
         )
-        self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
+        self.work.rows(np.where(state.passes < 0, _LOST, state.passes), len(robot.segments))
         bend = segment_bends(state.rotation, len(robot.segments))
         self.answer = RodAnswer(np.nan_to_num(state.tension), np.nan_to_num(bend))
         points, tip, tip_rotation = np.zeros((len(state.ok), 0, 3)), state.tip_position, state.tip_rotation
@@ -464,6 +528,7 @@ def prepare_log(
 ) -> PreparedLog:
     """The inputs of the rows of `samples` for `robot`, its tendons grouped into drives as in `wiring`; with
     the tension and the bends that are known of a robot `like` it."""
+    samples = samples.short
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     reader = Reader(layout, params, rest, len(log))

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.log.forward import LogSamples, PredictedPose, sample
+from fastrod.identification.log.forward import LogSamples, PredictedPose, Work, sample
 from fastrod.identification.log.inputs import inputs
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Lump, Robot
@@ -48,6 +48,7 @@ class MotionReplay:
     longest_step: float = LONGEST_STEP
     threads: int | None = None
     """None: one. A batch of differences fills a few lanes."""
+    work: Work = field(default_factory=Work)
 
     def poses(
         self, robots: Sequence[Sequence[Robot]], progress: Callable[[int, int], None] | None = None
@@ -83,6 +84,7 @@ class MotionReplay:
         held = held @ matrix_from_quaternion(np.array([rods[0].base_quaternion]))[0].T
         kept = np.zeros((len(clock.wanted), len(rods)), bool)
         last = int(clock.wanted[-1])
+        self.work.steps(last + 1, len(rods) * len(rods[0].segments))
         for step in range(last + 1):
             if step % _AT_ONCE == 0:
                 ahead = clock.inputs(step, given, len(robots))

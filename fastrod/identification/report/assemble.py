@@ -290,7 +290,7 @@ def assemble(
             *_of_sessions(final),
             *_left_out(explained, test_error),
         ],
-        solves=base.search.rod.runs,
+        solves=base.search.rod.work.batches,
         as_given_rms=shipped(base, explained.used, explained.test),
         revisits=(revisits[0], revisits[1]) if revisits[0] and revisits[1] else None,
     )
@@ -585,9 +585,9 @@ def tips_of(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
 def _tips(model: Model, theta: Floats, samples: LogSamples, base: BaseFit) -> Floats:
     """The same of a model at `theta` (p,)."""
     tip = np.full((len(samples.log), 3), np.nan)
-    most = max(len(tip), 1) if base.search.in_motion else ALL_AT_ONCE  # in motion rows need those before them
-    for start in range(0, len(tip), most):
-        rows = np.arange(start, min(start + most, len(tip)))
+    # in motion rows need those before them
+    pieces = 1 if base.search.in_motion else -(-len(tip) // ALL_AT_ONCE)
+    for rows in np.array_split(np.arange(len(tip)), pieces):
         pose = base.search.predict(model, theta, samples.on(rows))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip

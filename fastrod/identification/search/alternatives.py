@@ -201,7 +201,7 @@ def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
     wiring = linearised.model.wiring
     if not wiring.n_tendons or wiring.by_tension:
         return
-    dl = linearised.prepared.dl[linearised.samples.rows]
+    dl = linearised.prepared.dl[linearised.prepared.samples.rows]
     span = float(np.ptp(dl, axis=0).max())
     if span <= 0.0:
         return

@@ -279,7 +279,9 @@ class LinearisedModel:
     def driven(self, model: Model, theta: Floats) -> Floats:
         """(n, 6 + 3k) change of the true pose by tendons and tip forces, but for forces that go by the
         tip."""
-        opened = self.prepared.drive([each for each in effects_at(model, theta) if self.is_light(each.name)])
+        light = [each for each in effects_at(model, theta) if self.is_light(each.name)]
+        opened = self.prepared.drive(light)
+        self.rod.work.samples(len(self.prepared.dl) * (1 + sum(has_memory(each.effect) for each in light)))
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():

@@ -22,7 +22,7 @@ from fastrod.effects.executor import reads_bend, reads_tension
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import LogError, RobotError
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedPose
+from fastrod.identification.log.forward import LogSamples, PredictedPose, Work
 from fastrod.identification.log.motion import LONGEST_STEP, MotionReplay
 from fastrod.identification.log.noise import Noise, keep, read_noise
 from fastrod.identification.log.unknowns import Model, Unknown
@@ -138,10 +138,7 @@ class MotionRod:
     points: bool = False
     threads: int | None = None
     longest_step: float = LONGEST_STEP
-    runs: int = 0
-    """Batches moved so far."""
-    cost: float = 0.0
-    """Passes of a row beyond which nothing new is tried: in motion only time counts."""
+    work: Work = field(default_factory=Work)
     of_modes: ClassVar[bool] = False
     _known: dict[str, PredictedPose] = field(default_factory=dict)
     _elsewhere: MotionRod | None = None
@@ -156,7 +153,7 @@ class MotionRod:
             same = one and one.longest_step == step and one.samples.log is samples.log
             if one and same and np.array_equal(one.samples.rows, samples.rows):
                 return one
-        self._elsewhere = MotionRod(samples, self.points, self.threads, step)
+        self._elsewhere = MotionRod(samples, self.points, self.threads, step, self.work)
         return self._elsewhere
 
     def poses(self, robots: Sequence[tuple[Robot, ...]]) -> list[PredictedPose]:
@@ -171,12 +168,9 @@ class MotionRod:
         return found
 
     def _move(self, robots: dict[str, tuple[Robot, ...]]) -> None:
-        replay = MotionReplay(
-            self.samples, points=self.points, threads=self.threads, longest_step=self.longest_step
-        )
+        replay = MotionReplay(self.samples, self.points, self.longest_step, self.threads, self.work)
         for keys, batch in _batches(robots):
             self._known |= zip(keys, replay.poses(batch), strict=True)
-            self.runs += 1
 
 
 def _batches(robots: dict[str, tuple[Robot, ...]]) -> Iterator[tuple[list[str], list[tuple[Robot, ...]]]]:
@@ -439,7 +433,7 @@ def fit_motion(
             "is a mass, a stiffness or a damping_time far off?"
         )
     target = target_of(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=ANGLE, points=points)
-    left, solves = target.tip - pose.position, 0
+    left = target.tip - pose.position
     noise = _noise(samples, robot, left)
     # steps as long as the robot of the file allows
     for step in sorted({min(step, samples.step) for step in _LONGER if samples.step > LONGEST_STEP})[::-1]:
@@ -463,15 +457,13 @@ def fit_motion(
             seen = [u.name not in fixed for u in every.unknowns]
             model, theta = replace(every, unknowns=_those(every.unknowns, seen)), theta[seen]
         own = _weighed(own, noise, left[mine][good[mine]])
-        moving = MotionModel(model, theta, within, rod, own)
-        fit = moving.fit(model, theta, 10)
-        theta, solves = fit.theta, solves + rod.runs * (rod is not whole)
+        fit = MotionModel(model, theta, within, rod, own).fit(model, theta, 10)
+        theta = fit.theta
         (pose,) = whole.poses([model.in_sessions(theta)])
         left = np.where(pose.ok[:, None], target.tip - pose.position, left)
         noise = _noise(samples, robot, left)
     out = int((own.weight == 0.0).sum())
     notes = (f"{out} of {len(samples.rows)} rows are outliers and do not count",) if out else ()
-    whole.runs += solves
     moved = MotionSearch(samples, whole, own, blocks_of(len(samples.rows)), excluded, noise.sigma)
     search, state = moved.weighed(moved._state(model, moved._near(model, theta), fit, ()), noise.sigma)
     return BaseFit(robot=robot, search=search, noise=noise, start=state, fixed=fixed, notes=notes)

@@ -267,7 +267,7 @@ class Search:
     @property
     def spent(self) -> bool:
         """Whether the rod was solved so often that nothing new is to be tried."""
-        return self.rod.cost > MOST_PASSES
+        return self.rod.work.of_row > MOST_PASSES
 
     # ------------------------------------------------------------ candidates
 
