@@ -127,9 +127,9 @@ class LogSamples:
         """The same without samples that no memory misses, where few rows are compared: samples between two
         that are hardly apart in time and commands, which go straight from one to the other. A log of 500 Hz
         is a quarter of itself so, or less; one of 50 Hz stays as it is."""
-        if self.step >= _APART or not 0 < len(self.rows) < min(_FEW, len(self.time) // 2):
+        dl, few = self.log.pulls, 0 < len(self.rows) < min(_FEW, len(self.time) // 2)
+        if self.step >= _APART or not few or not dl.any():
             return self
-        dl = self.log.pulls
         path = np.cumsum(np.abs(np.diff(dl, axis=0, prepend=dl[:1])).max(1)) / np.abs(dl).max()
         every = np.floor(self.time / _APART) + np.floor(path / _MOVED)
         kept = np.diff(every, prepend=np.nan) != 0.0
