@@ -253,7 +253,7 @@ class Work:
     of_row: float = 0.0
     """Passes of a row at rest, on the average."""
     passes: float = 0.0
-    """Of one segment, all rows together, and what takes as long; 4 to 9 us of CPU time each."""
+    """Passes of one segment, all rows together, and what takes as long; 4 to 9 us of CPU time each."""
 
     def rows(self, passes: Ints, n_segments: int) -> None:
         """Count a batch solved in so many `passes` (n_rows,) each."""
