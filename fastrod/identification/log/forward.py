@@ -125,23 +125,23 @@ class LogSamples:
     @cached_property
     def short(self) -> LogSamples:
         """The same without samples that no memory misses, where few rows are compared: samples between two
-        that are hardly apart in time and commands, which go straight from one to the other. A log of 500 Hz
-        is a quarter of itself so, or less; one of 50 Hz stays as it is."""
+        that are within 20 ms and 1 % of the largest command of each other, where commands go straight from
+        one to the other. A log of 500 Hz is a quarter of itself so, or less; one of 50 Hz stays as it is."""
         dl, few = self.log.pulls, 0 < len(self.rows) < min(_FEW, len(self.time) // 2)
         if self.step >= _APART or not few or not dl.any():
             return self
-        path = np.cumsum(np.abs(np.diff(dl, axis=0, prepend=dl[:1])).max(1)) / np.abs(dl).max()
+        largest = np.abs(dl).max()
+        path = np.cumsum(np.abs(np.diff(dl, axis=0, prepend=dl[:1])).max(1)) / largest
         every = np.floor(self.time / _APART) + np.floor(path / _MOVED)
         kept = np.diff(every, prepend=np.nan) != 0.0
         kept[self.rows] = True
         for span in self.runs:
             kept[[span.start, span.stop - 1]] = True
-        straight = _STRAIGHT * np.abs(dl).max(initial=0.0)
         while True:
             bent = np.zeros(len(kept), bool)
             for s, column in product(self.runs, dl.T):
                 between = np.interp(self.time[s], self.time[s][kept[s]], column[s][kept[s]])
-                bent[s] |= ~kept[s] & (np.abs(between - column[s]) > straight)
+                bent[s] |= ~kept[s] & (np.abs(between - column[s]) > _STRAIGHT * largest)
             if not bent.any():
                 break
             kept |= bent
@@ -261,7 +261,7 @@ class Work:
         self.passes += float(passes.sum()) * n_segments
 
     def samples(self, n: int) -> None:
-        """Count an evaluation without a rod whose effects act on `n` samples, each on its own."""
+        """Count an evaluation without a rod whose effects act on `n` samples, all effects together."""
         self.passes += _EVALUATION + n / _SAMPLES
 
     def steps(self, n: int, n_segments: int) -> None:
