@@ -113,9 +113,11 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
         np.testing.assert_allclose(rig.drives.true_pulled, where, atol=2e-6)  # nothing moves by it
         assert rig.prototype.journal.lines[-1][1] == "release"
         rig.radius = 0.001
-        rig.wait(0.5)
+        # on so small a circle drives stand between two commands: all at once are not always seen moving
+        seen = [rig.drives.moving]
+        rig.wait(0.5, lambda: seen.append(rig.drives.moving) is not None)
         assert not rig.stopped(), rig.prototype.supervisor.status
-        assert rig.drives.moving.all()
+        assert np.any(seen, axis=0).all()
 
 
 def test_the_stop_is_in_time_at_the_largest_rate_too(tmp_path: Path) -> None:
