@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from fastrod.identification.attribution import identify
     from fastrod.identification.log.check import check
     from fastrod.identification.log.replay import replay
-    from fastrod.logs.runlog import RunLog, read_log, write_log
+    from fastrod.logs.reader import read_log
+    from fastrod.logs.runlog import RunLog, write_log
     from fastrod.simulator import Simulator
     from fastrod.solver.options import Modal, Modes, Observer
     from fastrod.solver.state import Pose, State
@@ -61,7 +62,7 @@ _HOME = {
     "Tips": "fastrod.solver.tape",
     "check": "fastrod.identification.log.check",
     "identify": "fastrod.identification.attribution",
-    "read_log": "fastrod.logs.runlog",
+    "read_log": "fastrod.logs.reader",
     "replay": "fastrod.identification.log.replay",
     "view": "fastrod_viewer.live",
     "write_log": "fastrod.logs.runlog",

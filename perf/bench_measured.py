@@ -15,7 +15,8 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from fastrod.identification.attribution import identify
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay
+from fastrod.identification.log.samples import sample
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Lump, Robot
 from fastrod.model.robotfile import load_robot

@@ -17,7 +17,8 @@ import fastrod
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import sample
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fastrod.errors import LogError
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod.logs.table import read_table
 from fastrod.model.robotfile import loads
 

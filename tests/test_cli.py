@@ -18,7 +18,8 @@ from reportlog import backlash_log
 
 from fastrod.commands import cli, terminal
 from fastrod.errors import InputError
-from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import write_log
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 

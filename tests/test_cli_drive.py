@@ -14,7 +14,7 @@ import pytest
 from fastrod import load_robot
 from fastrod.commands import drive
 from fastrod.commands.cli import main
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod_device.bench import boards, workbench
 from fastrod_device.can.clock import SteppedClock, WallClock
 from fastrod_device.emulator.emulator import Emulator

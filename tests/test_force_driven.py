@@ -16,7 +16,8 @@ import fastrod
 from fastrod.commands.cli import main
 from fastrod.errors import FastrodError, LogError, RobotError
 from fastrod.identification.excite import excitation
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model import taper
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import dumps, loads

@@ -21,10 +21,11 @@ from fastrod.errors import LogError, RobotError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.check import check
 from fastrod.identification.log.clock import clock_offset
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.order import column_order
 from fastrod.identification.log.replay import replay
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.identification.log.samples import sample
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.logs.table import read_table
 from fastrod.model.logformat import LogFormat
 from fastrod.model.robotfile import dumps, loads

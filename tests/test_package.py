@@ -19,7 +19,8 @@ SMOKE = """
 import fastrod, fastrod_scenes, fastrod_viewer, fastrod_device
 assert fastrod.robot_names() == ["ethz_beam", "five_segment_reacher", "prototype", "tdcr_a", "tdcr_b"]
 assert fastrod.load_robot("prototype").n_tendons == 4
-from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import write_log
 from importlib.resources import files
 log = read_log(files("fastrod") / "data" / "demo_log.csv", fastrod.load_robot("prototype"))
 """

@@ -16,8 +16,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import fastrod
 from fastrod.errors import InputError, LogError
 from fastrod.logs.link import Measurement
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import Recorder, free_path, recover
-from fastrod.logs.runlog import read_log
 
 ROBOT = fastrod.load_robot("prototype")
 GROUPS = "t run dl tip_position ext tip_quaternion points tip_force payload base_quaternion"

@@ -20,8 +20,9 @@ from fastrod.control.inverse import plan
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
 from fastrod.identification.excite import excitation
 from fastrod.logs.link import Measurement
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import Recorder
-from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.runlog import RunLog
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robotfile import dumps, loads, save_robot
 from fastrod.model.segment_actions import SegmentActions

@@ -18,7 +18,8 @@ from fastrod.errors import LogError
 from fastrod.identification.log.inputs import inputs, tendon_length
 from fastrod.identification.log.replay import Replay, replay
 from fastrod.identification.log.replay_output import DENSE, draw, table, write
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 

@@ -19,19 +19,10 @@ from reportlog import backlash_log
 
 from fastrod.effects.base import effect_names
 from fastrod.identification.attribution import identify
-from fastrod.identification.report import report
+from fastrod.identification.report import report, wording
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Found, Result
 from fastrod.identification.report.signals import Signals
-from fastrod.identification.report.wording import (
-    VERDICTS,
-    amount,
-    bound_sentence,
-    law,
-    percent,
-    plain_name,
-    with_error,
-)
 from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
@@ -190,10 +181,10 @@ def test_page_is_one_offline_file(html: str) -> None:
 def test_page_says_verdict_effects_and_what_to_run(result: Result, html: str) -> None:
     words = Reader(html).words
     assert all(sentence in words for sentence in re.split(r"(?<=\.) (?=[A-Z])", result.summary))
-    assert VERDICTS[result.verdict] in words
+    assert wording.VERDICTS[result.verdict] in words
     half_width = result.effects[0].parameters["half_width"]
-    assert with_error(half_width.value, half_width.stderr, "m") in words
-    for text in (law("backlash")["Equation"], law("backlash")["Source"], *result.advice):
+    assert wording.with_error(half_width.value, half_width.stderr, "m") in words
+    for text in (wording.law("backlash")["Equation"], wording.law("backlash")["Source"], *result.advice):
         assert text in words
     assert f"noise floor {1e3 * result.noise.floor:.3g} mm" in words
     assert html.count("<svg") == 8
@@ -308,12 +299,12 @@ FRIENDLY = {
 
 
 def test_numbers_are_said_in_friendly_units() -> None:
-    assert {key: amount(*key) for key in FRIENDLY} == FRIENDLY
-    assert with_error(0.00034284, 2.7e-6, "m") == "0.3428 ± 0.0027 mm"
-    assert with_error(0.372, 0.0, "kg/m") == "372 g/m"
-    assert [percent(s) for s in (0.12, 0.04, 0.0, 1.0, NAN)] == ["12 %", "4.0 %", "0 %", "100 %", "–"]
-    assert plain_name("segment.*.bending_stiffness") == "bending stiffness, all segments"
-    assert plain_name("tendon.2.gain") == "gain, tendon 2"
+    assert {key: wording.amount(*key) for key in FRIENDLY} == FRIENDLY
+    assert wording.with_error(0.00034284, 2.7e-6, "m") == "0.3428 ± 0.0027 mm"
+    assert wording.with_error(0.372, 0.0, "kg/m") == "372 g/m"
+    assert [wording.percent(s) for s in (0.12, 0.04, 0.0, 1.0, NAN)] == ["12 %", "4.0 %", "0 %", "100 %", "–"]
+    assert wording.plain_name("segment.*.bending_stiffness") == "bending stiffness, all segments"
+    assert wording.plain_name("tendon.2.gain") == "gain, tendon 2"
 
 
 BOUNDS = {
@@ -325,6 +316,6 @@ BOUNDS = {
 
 def test_bounds_are_sentences() -> None:
     for bound, words in BOUNDS.items():
-        assert bound_sentence(bound) == f"{words} would have shown"
-    none = bound_sentence(DetectionLimit("axial_compression", "per_bend", "1/rad", NAN))
+        assert wording.bound_sentence(bound) == f"{words} would have shown"
+    none = wording.bound_sentence(DetectionLimit("axial_compression", "per_bend", "1/rad", NAN))
     assert none.startswith("this log cannot show axial compression")

@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robotfile import load_robot
 from fastrod.model.routing import route
 

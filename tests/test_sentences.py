@@ -16,8 +16,8 @@ from fastrod import Simulator
 from fastrod.contact import ContactScene, sphere
 from fastrod.effects.base import Parameter, Seam, Static, effect, unregister
 from fastrod.errors import EffectError, InputError, LogError, RobotError, shown
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import recover
-from fastrod.logs.runlog import read_log
 from fastrod.model.robotfile import dumps, load_robot, save_robot
 from fastrod.solver.merge import merge_rows
 

@@ -210,7 +210,7 @@ class Stages:
 def _identified(robot: Robot, console: Console, out: Path | None) -> None:
     from fastrod.identification.attribution import identify
     from fastrod.identification.report import report
-    from fastrod.logs.runlog import read_log
+    from fastrod.logs.reader import read_log
 
     console.print(
         "\n[bold]demo_log.csv[/], a prototype simulated by another solver, with noise and an "

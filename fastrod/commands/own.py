@@ -174,7 +174,8 @@ def bring(
     --fps N: with it, its rate
     """
     from fastrod.loading import load_robot
-    from fastrod.logs.runlog import read_log, write_log
+    from fastrod.logs.reader import read_log
+    from fastrod.logs.runlog import write_log
 
     its = load_robot(robot)
     if lerobot is not None:
@@ -241,7 +242,7 @@ def check(log: Path, *, robot: str, out: Path | None = None) -> int:
 
     from fastrod.identification.log.check import check as look
     from fastrod.loading import load_robot
-    from fastrod.logs.runlog import read_log
+    from fastrod.logs.reader import read_log
     from fastrod.model.robotfile import save_robot
 
     its = load_robot(robot)

@@ -26,7 +26,8 @@ from fastrod.identification.log.questions import read, time_question
 from fastrod.identification.log.registration import between
 from fastrod.identification.log.split import SplitLog, split, thinned
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.report.assemble import assemble, explain, verdict_on
+from fastrod.identification.report.assemble import assemble, verdict_on
+from fastrod.identification.report.explained import explain
 from fastrod.identification.report.motion import named
 from fastrod.identification.report.result import Result
 from fastrod.identification.report.wording import with_error
@@ -39,7 +40,8 @@ from fastrod.identification.search.search import MOST_PASSES, Search, SearchOutc
 from fastrod.identification.search.solve import rms
 from fastrod.identification.search.structure import are_pulled, are_worth_trying, one_sided
 from fastrod.loading import robot_of
-from fastrod.logs.runlog import RunLog, log_of, on_one_clock
+from fastrod.logs.reader import log_of
+from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.solver.options import Observer, solver_of

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import InputError, LogError, nearest
-from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog
 from fastrod.logs.table import Table, numbers, read_table
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.robotfile import load_robot

@@ -14,7 +14,7 @@ from windows import ARGUMENTS, PATIENCE, Window
 import fastrod
 from fastrod.identification.attribution import identify
 from fastrod.identification.report.report import write
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod_viewer.app import App
 
 REQUIRED = bool(os.environ.get("FASTROD_REQUIRE_BROWSER"))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pages import DRIVE
 from windows import PATIENCE, Window
 
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod_device.bench.workbench import EmulatedBench, emulated
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware

@@ -10,7 +10,7 @@ from windows import Window
 
 import fastrod
 from fastrod.identification.log.replay import replay
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod_viewer.app import DEMO_LOG, App
 from fastrod_viewer.drive.page import DrivePage
 from fastrod_viewer.export import external_references

@@ -28,7 +28,7 @@ from fastrod.commands.cli import main
 from fastrod.contact import MeshLimits, mesh
 from fastrod.contact.meshfile import read_mesh
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
-from fastrod.logs.runlog import read_log
+from fastrod.logs.reader import read_log
 from fastrod.model.robotfile import load_robot
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_envs.learning.policies import Policy, find

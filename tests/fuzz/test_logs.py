@@ -15,8 +15,9 @@ from numpy.testing import assert_array_equal
 
 from fastrod.commands import cli
 from fastrod.errors import FastrodError
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import recover
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robotfile import load_robot
 
 ROBOT = load_robot("prototype")

@@ -10,7 +10,7 @@ from rods import rod
 
 from fastrod import Robot, Tendon
 from fastrod.identification.excite import excitation
-from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route
 

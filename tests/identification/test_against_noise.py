@@ -15,10 +15,11 @@ from truth import plant
 from fastrod.identification.attribution import _candidates, _needed, identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import sample
 from fastrod.identification.log.split import split, thinned
 from fastrod.identification.report import report
-from fastrod.identification.report.assemble import Explained
+from fastrod.identification.report.explained import Explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Error, Result
 from fastrod.identification.search import search

@@ -10,7 +10,7 @@ from identification.logs import bare_run, displacement_of, log_of, one_segment
 from numpy.testing import assert_allclose
 from rods import rod
 
-from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.search.residual_test import (
     ResidualStructure,
     faster_than_commands,

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from fastrod.effects.executor import link, stay_back
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.result import Result
 from fastrod.model.routing import route
 

@@ -12,8 +12,9 @@ from identification.logs import log_of, one_segment, wave
 from numpy.testing import assert_allclose
 
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, sample
+from fastrod.identification.log.forward import PredictedRod
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.search.linearised import target_of
 from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.search import N_BLOCKS, Search

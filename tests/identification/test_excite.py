@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, load_robot
 from fastrod.identification.excite import REST, Excitation, excitation
-from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import write_log
 from fastrod.model.routing import route
 
 ROBOTS = pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from truth import plant
 
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, sample
+from fastrod.identification.log.forward import PredictedRod
+from fastrod.identification.log.samples import sample
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.model.robotfile import load_robot

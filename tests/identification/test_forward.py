@@ -21,14 +21,13 @@ from fastrod.errors import EffectError
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.forward import (
     N_STEPS,
-    LogSamples,
     PredictedPose,
     PredictedRod,
     effects_at,
     predict,
     prepare_log,
-    sample,
 )
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route

@@ -10,7 +10,7 @@ from identification.logs import log_of, one_segment
 from rods import rod
 
 from fastrod import load_robot
-from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.report.assemble import rings, shears
 from fastrod.model.robot import Lump
 

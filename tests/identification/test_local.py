@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import Robot
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 

@@ -18,9 +18,9 @@ from fastrod.errors import InputError, LogError, RobotError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log import motion
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.motion import MotionReplay, beginnings, let_go
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.motion import MotionRod, SideBySide
 from fastrod.logs.runlog import RunLog, write_log

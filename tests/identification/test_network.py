@@ -15,7 +15,7 @@ from reportlog import backlash_log
 from fastrod.errors import InputError
 from fastrod.identification.attribution import identify
 from fastrod.identification.learned.network import residual_network
-from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.split import held_out_rows
 from fastrod.model.robotfile import load_robot
 from fastrod.model.routing import route

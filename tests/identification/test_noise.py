@@ -13,9 +13,9 @@ from reportlog import backlash_log
 
 from fastrod.identification.log.autoregression import AutoRegression
 from fastrod.identification.log.camera import earlier, pictures, repeated, sentences
-from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.model.robotfile import load_robot
 
 SIGMA = np.array([2e-4, 3e-4, 5e-4])

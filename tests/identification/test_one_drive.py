@@ -17,8 +17,9 @@ from fastrod.effects.executor import act, link
 from fastrod.errors import EffectError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import prepare_log, sample
+from fastrod.identification.log.forward import prepare_log
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.result import Result
 from fastrod.model.routing import route
 

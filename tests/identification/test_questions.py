@@ -24,7 +24,8 @@ from fastrod.identification.log.registration import align, between
 from fastrod.identification.log.replay import replay
 from fastrod.identification.report import report
 from fastrod.identification.report.result import Result
-from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog
 from fastrod.model.robotfile import loads
 from fastrod.rotation import quaternion_from_matrix
 

@@ -14,8 +14,8 @@ from rods import rod
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.log.split import held_out_rows, merged
 
 NAN = float("nan")

@@ -9,8 +9,8 @@ import pytest
 from identification.logs import displacement_of, log_of, one_segment
 
 from fastrod.identification.attribution import identify
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.log.unknowns import known_model
 from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.revisits import Visits, visits

@@ -15,12 +15,13 @@ from identification.logs import displacement_of, log_of, one_segment, one_sided,
 from fastrod.commands.cli import main
 from fastrod.errors import LogError
 from fastrod.identification.attribution import identify
-from fastrod.identification.log.forward import sample
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.report import write
 from fastrod.identification.search.solve import Estimate
 from fastrod.logs.drives import moved, sentences
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robotfile import load_robot, save_robot
 
 NOISE, N, DT = 1e-4, 240, 0.05

@@ -13,7 +13,8 @@ from identification.logs import log_of, one_segment
 
 from fastrod import Robot, Tendon
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, target_of
 from fastrod.identification.search.model_selection import ModelState
 from fastrod.identification.search.search import Search

@@ -9,7 +9,7 @@ import pytest
 from identification.logs import runs_of as log
 from numpy.testing import assert_array_equal
 
-from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.log.split import held_out_rows, merged
 from fastrod.logs.runlog import RunLog
 

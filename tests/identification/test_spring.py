@@ -13,8 +13,9 @@ from identification.logs import log_of, one_segment, two_segments, wave
 from fastrod import Robot
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.identification.search.search import N_BLOCKS, Search

@@ -14,7 +14,8 @@ from numpy.testing import assert_allclose
 from fastrod import Robot, Tendon
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.base_model import base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import sample
 from fastrod.identification.report.report import table, to_json
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.structure import NAME, _unopposed, _with_antagonists

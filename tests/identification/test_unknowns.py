@@ -15,8 +15,9 @@ from rods import rod
 from fastrod import Robot
 from fastrod.effects.base import columns, effect_names, get_effect
 from fastrod.identification.log.base_model import FREE_CAMERA, STIFFNESS_SD, base_model
-from fastrod.identification.log.forward import PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
 from fastrod.identification.log.replay import replay
+from fastrod.identification.log.samples import sample
 from fastrod.identification.log.unknowns import Model, effect_unknowns
 from fastrod.model.robotfile import dumps, loads
 from fastrod.model.routing import route

@@ -15,7 +15,8 @@ from fastrod import Simulator, load_robot
 from fastrod.control import references
 from fastrod.control.inverse import InversePlan
 from fastrod.identification.excite import Excitation
-from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route
 from fastrod.types import Floats
 from fastrod_device.bench.experiment import excite, follow, tracking

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import fastrod
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import Recorder
-from fastrod.logs.runlog import read_log
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.drive.controls import drive_controls
 from fastrod_viewer.drive.linked import Linked, TendonLimits

@@ -15,7 +15,8 @@ from fastrod.commands.cli import main
 from fastrod.errors import LogError, UnknownNameError
 from fastrod.identification.log.base_model import base_model
 from fastrod.identification.log.check import check
-from fastrod.logs.runlog import read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import write_log
 from fastrod.logs.table import read_table
 from fastrod.model.robotfile import dumps, loads
 from fastrod.model.routing import route

@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import fastrod
 from fastrod.errors import InputError, LogError
 from fastrod.identification.log.replay import replay
-from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.logs.reader import read_log
+from fastrod.logs.runlog import RunLog, write_log
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import save_robot
 from fastrod.rotation import matrix_from_quaternion

@@ -12,8 +12,8 @@ import pytest
 from benches import started
 
 from fastrod.errors import InputError
+from fastrod.logs.reader import read_log
 from fastrod.logs.recording import recover
-from fastrod.logs.runlog import read_log
 from fastrod.types import Floats
 from fastrod_device.can.clock import Clock
 from fastrod_device.hardware import load_hardware

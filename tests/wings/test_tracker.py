@@ -17,24 +17,14 @@ from fastrod.model.robotfile import load_robot
 from fastrod.rotation import quaternion_from_vector
 from fastrod_device.errors import DeviceError
 from fastrod_device.vision import camera as camera_module
-from fastrod_device.vision.camera import (
-    Camera,
-    CameraFrame,
-    Marker,
-    VideoCamera,
-    compose,
-    inverse,
-    load_camera,
-    rotation,
-    save_camera,
-)
+from fastrod_device.vision import camera as cameras
 from fastrod_device.vision.drawing import DrawnScene, Eye, draw, project
 from fastrod_device.vision.gates import FrameOrder, Workspace
 from fastrod_device.vision.tracker import MarkerTracker
 
-CAMERA = Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
+CAMERA = cameras.Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
 BENT = replace(CAMERA, distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0))
-MARKER = Marker(size=0.015, id=7)
+MARKER = cameras.Marker(size=0.015, id=7)
 SHARP = DrawnScene(blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
 SQUARE = 0.0075 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 FACING = np.array([0.0, 1.0, 0.0, 0.0])  # the marker's z toward the camera
@@ -45,7 +35,7 @@ def angle(a, b):
 
 
 def framed(image, t=0.0, number=1):
-    return CameraFrame(image=image, t=t, number=number)
+    return cameras.CameraFrame(image=image, t=t, number=number)
 
 
 def frames(camera, poses, scene=None):
@@ -81,7 +71,7 @@ def test_drawing_is_a_slow_obvious_twin():
     fine = np.stack(np.broadcast_arrays(x, y), -1).reshape(-1, 1, 2).astype(np.float64)
     many = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     rays = cv2.undistortPoints(fine, BENT.intrinsics, BENT.lens, criteria=many).reshape(-1, 2)
-    R = rotation(quaternion)
+    R = cameras.rotation(quaternion)
     rays = np.column_stack([rays, np.ones(len(rays))])
     on = (rays * (R[:, 2] @ position / (rays @ R[:, 2]))[:, None] - position) @ R[:, :2]
     cell = MARKER.size / 6.0
@@ -138,7 +128,7 @@ def test_clean_pictures_have_no_bias(camera, tilt):
         tracker.reset()
         seen = tracker.look(framed(draw(camera, MARKER, *there, rng=rng, scene=scene), number=k), there)
         assert seen.flag in ("", "ambiguous")
-        corner.append(seen.corners - project(camera, SQUARE @ rotation(there[1]).T + there[0]))
+        corner.append(seen.corners - project(camera, SQUARE @ cameras.rotation(there[1]).T + there[0]))
         moved.append(seen.position - there[0])
     assert np.abs(np.mean(corner, axis=0)).max() < 0.02
     assert np.std(corner) < 0.03
@@ -191,8 +181,8 @@ def test_place_of_camera_and_marker():
 
     camera = placed(CAMERA, (0.04, 0.0, 0.215), 0.3, 2.7, 0.1)
     marker = placed(MARKER, (0.001, -0.002, 0.003), 0.05, 0.1, 0.7)
-    base_from_marker = compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4))
-    base_from_tip = compose(base_from_marker, inverse(marker.tip_from_marker))
+    base_from_marker = cameras.compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4))
+    base_from_tip = cameras.compose(base_from_marker, cameras.inverse(marker.tip_from_marker))
     image = Eye(camera, marker).draw(*base_from_tip)
     seen = MarkerTracker(camera, marker).look(framed(image, 1.0, 4))
     assert (seen.flag, seen.t, seen.number) == ("", 1.0, 4)
@@ -269,7 +259,7 @@ def test_no_curve_that_bends_within_the_limit_is_outside_the_workspace():
             frame, tip = np.eye(3), np.zeros(3)
             axis = rng.normal(size=(1 if k % 2 else n, 3)) * (1.0, 1.0, 0.0)  # a circle, or wild
             for u in np.broadcast_to(bent * axis / np.linalg.norm(axis, axis=1)[:, None], (n, 3)):
-                half = rotation(quaternion_from_vector(0.5 * ds * u))
+                half = cameras.rotation(quaternion_from_vector(0.5 * ds * u))
                 tip = tip + ds * (frame @ half)[:, 2]
                 frame = frame @ half @ half
             assert workspace.refusal(tip, tip) == ""
@@ -368,7 +358,7 @@ def test_a_covered_side_is_an_outlier():
 def test_other_markers_are_not_taken():
     image = Eye(CAMERA, replace(MARKER, id=3)).draw(*pose(0.15, 0.2, 0.0, 0.0))
     assert MarkerTracker(CAMERA, MARKER).look(framed(image)).flag == "no marker"
-    apriltag = Marker(size=0.015, id=5, dictionary="DICT_APRILTAG_16h5")
+    apriltag = cameras.Marker(size=0.015, id=5, dictionary="DICT_APRILTAG_16h5")
     there = pose(0.12, 0.3, 0.0, 0.0)
     seen = MarkerTracker(CAMERA, apriltag).look(framed(Eye(CAMERA, apriltag).draw(*there)))
     assert seen.ok
@@ -377,10 +367,10 @@ def test_other_markers_are_not_taken():
 
 def test_camera_file_round_trip(tmp_path):
     camera = replace(BENT, position=(0.1, 0.2, 0.3), quaternion=(0.6, 0.0, 0.8, 0.0), rate=15.0, latency=0.03)
-    save_camera(camera, tmp_path / "camera.toml")
-    assert load_camera(tmp_path / "camera.toml") == camera
+    cameras.save_camera(camera, tmp_path / "camera.toml")
+    assert cameras.load_camera(tmp_path / "camera.toml") == camera
     with pytest.raises(InputError, match=r"does not end in \.toml"):
-        save_camera(camera, tmp_path / "camera.json")
+        cameras.save_camera(camera, tmp_path / "camera.json")
 
 
 class Capture:
@@ -403,7 +393,7 @@ def test_video_camera(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture)
     monkeypatch.setattr(camera_module, "_STILL", 3)
     still = SimpleNamespace(stepped=False, now=lambda: 7.0, sleep_until=lambda _: None)  # a clock at 7 s
-    source = VideoCamera(replace(CAMERA, latency=0.25), 0, clock=still)
+    source = cameras.VideoCamera(replace(CAMERA, latency=0.25), 0, clock=still)
     source._thread.join(5.0)
     frame = source.read()
     assert (frame.number, frame.t, frame.image.shape) == (5, 6.75, (480, 640))
@@ -425,4 +415,4 @@ SIZES = "gives pictures of 200 x 100 px; it must give 640 x 480 px"
 def test_video_camera_that_is_not_there(capture, sentence, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: Capture(**capture))
     with pytest.raises(DeviceError, match=sentence):
-        VideoCamera(CAMERA, 3)
+        cameras.VideoCamera(CAMERA, 3)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.residual_test import features
 from fastrod.model.routing import Routing

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fastrod.effects.base import get_effect, trait
-from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.log.noise import at_rest
+from fastrod.identification.log.samples import LogSamples
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 

@@ -12,11 +12,12 @@ from fastrod.errors import LogError
 from fastrod.identification.log.advice import excitation
 from fastrod.identification.log.camera import sentences
 from fastrod.identification.log.clock import clock_offset, clock_sentence
-from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.order import ColumnOrder, column_order
 from fastrod.identification.log.questions import left_by, read
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.loading import robot_of
-from fastrod.logs.runlog import RunLog, log_of, on_one_clock
+from fastrod.logs.reader import log_of
+from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Floats

@@ -10,8 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
+from fastrod.identification.log.forward import PredictedRod, predict
 from fastrod.identification.log.registration import align, size
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot

@@ -9,37 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fastrod.effects import executor
 from fastrod.effects.base import BodyOperator, Seam, has_memory
-from fastrod.effects.executor import (
-    Link,
-    SensedPoses,
-    act,
-    approach,
-    approached,
-    feels_tip,
-    from_base,
-    link,
-    reads_bend,
-    reads_tension,
-    relaxed,
-    sense,
-    stay_back,
-    sweep,
-    tip_feedback,
-)
+from fastrod.effects.executor import Link
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import InputError
-from fastrod.identification.log.camera import earlier, pictures, unmeasured
 from fastrod.identification.log.inputs import inputs
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model
-from fastrod.logs.drives import moved
-from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
 from fastrod.model.routing import Routing, route
@@ -58,10 +39,6 @@ _LOST = 500
 _SAMPLES, _EVALUATION, _STEP = 50, 200, 60
 _ROUGH = 1e-5, 1e-3  # of the length; rad
 _BALANCE = 40  # rounds in which a rod and a force that goes by its tip come to rest
-_SOON = 10.0  # s
-_FEW = 2000  # rows, beside which memories may take long
-_APART, _MOVED, _STRAIGHT = 0.02, 0.01, 1e-4  # s; of the largest command
-_GAP = 3.0  # times the usual time between two rows of a run
 _FORCE = 2e-3  # of EI / l^2, step of the compliance of the tip
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 
@@ -77,162 +54,6 @@ class PredictedPose(NamedTuple):
     """(n, k, 3) further points [m]."""
     ok: Flags
     """(n,) the rod converged."""
-
-
-@dataclass(frozen=True, eq=False)
-class LogSamples:
-    """The driven rows of a log in the order in which they happened, and which of them the loss looks at."""
-
-    log: RunLog
-    """Only driven rows that have a time."""
-    origin: Ints
-    """(n,) their rows in the log that was given; of the end of a gap that of the row before it. A row whose
-    picture was taken before it is two: one at the time of the picture, and one that is not measured."""
-    rows: Ints
-    """(n_rows,) samples that are solved and compared."""
-    runs: tuple[slice, ...]
-    """Samples of each run."""
-    time: Floats
-    """(n,) since the start of its run [s]."""
-    dt: Floats
-    """(n,) since the sample before; 0 at the start of a run, unless it continues the run before [s]."""
-    session: Ints
-    """(n,) number of each sample's session."""
-    sessions: tuple[str, ...]
-    """Their labels, that of most samples first; ("",) of a log without."""
-    step: float
-    """Usual time from one row of the log to the next [s]; 0 where no two have times of their own."""
-
-    @property
-    def given(self) -> Ints:
-        """Samples that stand for rows of the log, measured ones for their pictures; not the ends of gaps."""
-        return np.flatnonzero(np.diff(self.origin, prepend=-1))
-
-    @property
-    def histories(self) -> tuple[slice, ...]:
-        """Samples over which a memory goes on: of each run, with the runs that continue it."""
-        starts = [span.start for span in self.runs if not self.dt[span.start]]
-        return tuple(slice(*ends) for ends in pairwise([*starts, len(self.dt)]))
-
-    def histories_of(self, session: int) -> list[slice]:
-        """Those of one session, by its number."""
-        return [span for span in self.histories if self.session[span.start] == session]
-
-    def on(self, rows: Ints) -> LogSamples:
-        """The same samples, compared at other rows."""
-        return replace(self, rows=rows)
-
-    @cached_property
-    def short(self) -> LogSamples:
-        """The same without samples that no memory misses, where few rows are compared: samples between two
-        that are within 20 ms and 1 % of the largest command of each other, where commands go straight from
-        one to the other. A log of 500 Hz is a quarter of itself so, or less; one of 50 Hz stays as it is."""
-        dl, few = self.log.pulls, 0 < len(self.rows) < min(_FEW, len(self.time) // 2)
-        if self.step >= _APART or not few or not dl.any():
-            return self
-        largest = np.abs(dl).max()
-        path = np.cumsum(np.abs(np.diff(dl, axis=0, prepend=dl[:1])).max(1)) / largest
-        every = np.floor(self.time / _APART) + np.floor(path / _MOVED)
-        kept = np.diff(every, prepend=np.nan) != 0.0
-        kept[self.rows] = True
-        for span in self.runs:
-            kept[[span.start, span.stop - 1]] = True
-        while True:
-            bent = np.zeros(len(kept), bool)
-            for s, column in product(self.runs, dl.T):
-                between = np.interp(self.time[s], self.time[s][kept[s]], column[s][kept[s]])
-                bent[s] |= ~kept[s] & (np.abs(between - column[s]) > _STRAIGHT * largest)
-            if not bent.any():
-                break
-            kept |= bent
-        some = np.flatnonzero(kept)
-        spans = (np.searchsorted(some, [span.start, span.stop]).tolist() for span in self.runs)
-        return replace(
-            self,
-            log=self.log.rows(some),
-            origin=self.origin[some],
-            rows=np.searchsorted(some, self.rows),
-            runs=tuple(slice(*ends) for ends in spans),
-            time=self.time[some],
-            dt=np.diff(np.cumsum(self.dt)[some], prepend=0.0),
-            session=self.session[some],
-        )
-
-
-def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
-    """The samples of a log, moved by its drives where these were measured; runs that are interleaved are put
-    one after the other. A gap in time is a hold: its inputs stay as they were up to one step before it
-    ends."""
-    log, late = pictures(moved(log))
-    used = np.flatnonzero(log.driven & np.isfinite(log.t))
-    order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
-    ordered, order = _held(log.rows(order), order)
-    steps = np.diff(ordered.t)[ordered.run[1:] == ordered.run[:-1]]
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    ordered, order = _pictured(ordered, order, late)
-    starts = np.flatnonzero(np.concatenate([[True], ordered.run[1:] != ordered.run[:-1]]))
-    ends = [*starts[1:].tolist(), len(ordered)]
-    runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
-    time, dt = np.empty(len(ordered)), np.zeros(len(ordered))
-    t, dl = ordered.t, ordered.commands
-    session = np.full(len(ordered), "") if ordered.session is None else ordered.session
-    largest = max((np.abs(np.diff(dl[span], axis=0)).max(initial=0.0) for span in runs), default=0.0)
-    for span in runs:
-        first = span.start
-        time[span] = t[span] - t[first]
-        dt[first + 1 : span.stop] = np.diff(t[span])
-        # a run goes on where the one before ends: soon after it, and the commands do not jump
-        jump = np.abs(dl[first] - dl[first - 1]).max(initial=0.0)
-        same = bool(first) and session[first] == session[first - 1]
-        if same and 0.0 < t[first] - t[first - 1] <= _SOON and jump <= largest:
-            dt[first] = t[first] - t[first - 1]
-    measured = np.flatnonzero(ordered.measured) if rows is None else rows
-    labels, number, count = np.unique(session, return_inverse=True, return_counts=True)
-    largest_first = np.argsort(-count, kind="stable")
-    return LogSamples(
-        ordered,
-        order,
-        measured,
-        runs,
-        time,
-        dt,
-        np.argsort(largest_first)[number],
-        tuple(labels[largest_first].tolist()),
-        usual,
-    )
-
-
-def _pictured(log: RunLog, order: Ints, late: Floats) -> tuple[RunLog, Ints]:
-    """The log with each picture that had waited for its row in one of its own, before that row, and the
-    `order` (n,) likewise; `late` is of the rows of the log that was given."""
-    late = np.where(log.measured, late[order], 0.0)
-    rows = np.flatnonzero(late)
-    if not len(rows):
-        return log, order
-    both = np.insert(np.arange(len(log)), rows, rows)
-    pictures = rows + np.arange(len(rows))
-    waits, own = np.zeros(len(both)), np.zeros(len(both), bool)
-    waits[pictures], own[pictures + 1] = late[rows], True
-    return unmeasured(earlier(log.rows(both), waits), own), order[both]
-
-
-def _held(log: RunLog, order: Ints) -> tuple[RunLog, Ints]:
-    """The log with one more row where each gap ends, as before it and not measured; and the `order` (n,)
-    likewise."""
-    dt = np.where(log.run[1:] == log.run[:-1], np.diff(log.t), 0.0)
-    usual = {
-        label: np.median(own) for label in log.runs if len(own := dt[(log.run[1:] == label) & (dt > 0.0)])
-    }
-    step = np.array([usual.get(label, np.inf) for label in log.run[1:]])
-    before = np.flatnonzero(dt > _GAP * step)
-    if not len(before):
-        return log, order
-    both = np.insert(np.arange(len(log)), before + 1, before)
-    ends = before + 1 + np.arange(len(before))
-    made = log.rows(both)
-    t, tip = made.t.copy(), made.tip_position.copy()
-    t[ends], tip[ends] = log.t[before + 1] - step[before], np.nan
-    return replace(made, t=t, tip_position=tip), order[both]
 
 
 class RodAnswer(NamedTuple):
@@ -324,7 +145,7 @@ class PredictedRod:
                 found, tip, tip_rotation = found[:, :-1], found[:, -1], rotation[:, -1]
             if self.points:
                 points = found - ports.base_pose[:, None, :3]
-        return PredictedPose(*from_base(ports.base_pose, tip, tip_rotation, points), state.ok)
+        return PredictedPose(*executor.from_base(ports.base_pose, tip, tip_rotation, points), state.ok)
 
     @property
     def of_modes(self) -> bool:
@@ -417,10 +238,10 @@ class PreparedLog:
             for each in links[:swept]:
                 if has_memory(each.effect):
                     for k in range(len(each.values)):
-                        sweep(each.alone(k), every, self._histories(each, k), self.samples.dt)
+                        executor.sweep(each.alone(k), every, self._histories(each, k), self.samples.dt)
                 else:
-                    act([each.over(self.samples.session)], every)
-                    act([each.over(at_rows)], opened)  # for what it changes beside the tendons' lengths
+                    executor.act([each.over(self.samples.session)], every)
+                    executor.act([each.over(at_rows)], opened)  # for what it changes beside lengths
             dl = every.dl
             opened.tendon_length = dl[self.samples.rows] + rest
         bend = self.wiring.bend(dl) if self.beyond is None else self.wiring.bend(dl) + self.beyond
@@ -428,10 +249,10 @@ class PreparedLog:
         for each in links[swept:]:
             if isinstance(each.effect, BodyOperator):
                 for k in range(len(each.values)):
-                    held = stay_back(each.alone(k), bend, self._histories(each, k))
+                    held = executor.stay_back(each.alone(k), bend, self._histories(each, k))
                     opened.rest_bend += held[self.samples.rows]
             else:
-                act([each.over(at_rows)], opened)
+                executor.act([each.over(at_rows)], opened)
         return opened
 
     def _histories(self, one: Link, k: int) -> Sequence[slice]:
@@ -447,14 +268,16 @@ class PreparedLog:
         tolerance, turned = _ROUGH if rough else (3.0 * TOLERANCE, 3.0 * TOLERANCE)
         place, (opened, pose, answer) = self, self._solve(links, rod, robot)
         off = np.full(len(pose.ok), np.inf)
-        least, n = approach(links, self.wiring.n_segments), len(pose.ok)
+        least, n = executor.approach(links, self.wiring.n_segments), len(pose.ok)
         fraction, gap = np.broadcast_to(least, (n,)), (answer.bend - opened.solved_bend).reshape(n, -1)
-        bends = any(reads_bend(each.effect) for each in links)
-        for _ in range(_BALANCE if bends or any(reads_tension(each.effect) for each in links) else 0):
+        bends = any(executor.reads_bend(each.effect) for each in links)
+        for _ in range(
+            _BALANCE if bends or any(executor.reads_tension(each.effect) for each in links) else 0
+        ):
             before, place = pose, place.under(answer, opened.solved_bend, pose.ok, fraction)
             opened, pose, answer = place._solve(links, rod, robot)
             gap, last = (answer.bend - opened.solved_bend).reshape(n, -1), gap
-            fraction = relaxed(fraction, gap, last, least)
+            fraction = executor.relaxed(fraction, gap, last, least)
             off = np.linalg.norm(pose.position - before.position, axis=1)
             if bends:
                 off = np.maximum(off, robot.length * np.abs(gap).max(1) * tolerance / turned)
@@ -471,7 +294,9 @@ class PreparedLog:
         `robot` at these, with what else the rod answers. A row at which such a force and the rod find no
         balance is not `ok`."""
         felt = [
-            each.over(self.samples.session[self.samples.rows]) for each in links if feels_tip(each.effect)
+            each.over(self.samples.session[self.samples.rows])
+            for each in links
+            if executor.feels_tip(each.effect)
         ]
         opened = self.drive(links)
         pose = rod.solve(*self.kernel(opened), robot)
@@ -489,8 +314,8 @@ class PreparedLog:
             rod.back(kept)
         opened.tip_force, by_force = given, np.stack(columns, axis=-1)
         for _ in range(_BALANCE):
-            target, slopes = tip_feedback(felt, opened, pose.position)
-            now = approached(force, target, slopes, by_force)
+            target, slopes = executor.tip_feedback(felt, opened, pose.position)
+            now = executor.approached(force, target, slopes, by_force)
             change = np.where(pose.ok[:, None], now - force, 0.0)
             expected = np.einsum("nij,nj->ni", by_force, change)
             off = np.linalg.norm(expected, axis=1)
@@ -520,7 +345,7 @@ class PreparedLog:
         sensing = [each.over(at_rows) for each in links if each.effect.seam is Seam.SENSING]
         if not sensing:
             return pose
-        return PredictedPose(*sense(sensing, self.open(), SensedPoses(*pose[:3])), pose.ok)
+        return PredictedPose(*executor.sense(sensing, self.open(), executor.SensedPoses(*pose[:3])), pose.ok)
 
 
 def prepare_log(
@@ -561,9 +386,9 @@ def effects_at(model: Model, theta: Floats) -> list[Link]:
     Raises `InputError` for a memory of other things than tendons and bends: only those are carried over a
     log.
     """
-    links = [link(name, values, model.wiring) for name, values in model.by_session(theta).items()]
+    links = [executor.link(name, values, model.wiring) for name, values in model.by_session(theta).items()]
     for each in links:
-        if has_memory(each.effect) and not (_of_tendons(each) or reads_bend(each.effect)):
+        if has_memory(each.effect) and not (_of_tendons(each) or executor.reads_bend(each.effect)):
             raise InputError(
                 f"effect {each.name!r} has a memory at the seam {each.effect.seam.name}; over a log only "
                 "those of ACTUATION and those that read the bend are carried."

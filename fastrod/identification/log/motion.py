@@ -16,8 +16,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.log.forward import LogSamples, PredictedPose, Work, sample
+from fastrod.identification.log.forward import PredictedPose, Work
 from fastrod.identification.log.inputs import inputs
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Lump, Robot
 from fastrod.rotation import matrix_from_quaternion

@@ -9,7 +9,7 @@ import numpy as np
 
 from fastrod.identification.log.autoregression import AutoRegression, RestNoise, RestStretch, read_rest
 from fastrod.identification.log.camera import resolution
-from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.log.samples import LogSamples
 from fastrod.types import Flags, Floats, Ints
 
 _STILL = 2e-4  # of an input's range; less is no motion

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.log.samples import LogSamples
 from fastrod.model.robot import Robot
 from fastrod.model.routing import route
 from fastrod.types import Floats, Ints

@@ -16,9 +16,10 @@ import numpy as np
 
 from fastrod.identification.log.camera import sentences
 from fastrod.identification.log.clock import clock_offset, clock_sentence
-from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedPose, PredictedRod, predict
 from fastrod.identification.log.order import column_order
 from fastrod.identification.log.registration import CameraRegistration, align, size
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog, on_one_clock
 from fastrod.model.robot import Robot

@@ -15,7 +15,8 @@ from fastrod.identification.log.camera import earlier, pictures
 from fastrod.identification.log.inputs import base_of, check_driven, inputs
 from fastrod.loading import robot_of
 from fastrod.logs.drives import moved
-from fastrod.logs.runlog import RunLog, log_of
+from fastrod.logs.reader import log_of
+from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
 from fastrod.threads import one_blas_thread
 from fastrod.types import Flags, Floats, Ints
@@ -197,7 +198,8 @@ def _with_effects(
     log: RunLog, robot: Robot, with_points: bool
 ) -> tuple[Ints, Callable[[Ints], tuple[Floats, Floats, Flags]]]:
     """Rows of the log in the order of its runs, and what solves some of these."""
-    from fastrod.identification.log.forward import PredictedRod, predict, sample  # they load numba
+    from fastrod.identification.log.forward import PredictedRod, predict  # they load numba
+    from fastrod.identification.log.samples import sample
     from fastrod.identification.log.unknowns import known_model
 
     samples, model = sample(log), known_model(robot)

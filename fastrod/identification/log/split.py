@@ -11,9 +11,9 @@ import numpy as np
 
 from fastrod.errors import LogError, UnknownNameError, nearest
 from fastrod.identification.log import camera
-from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.inputs import check_driven
 from fastrod.identification.log.motion import let_go
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.logs import drives
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot

@@ -5,22 +5,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedPose
-from fastrod.identification.log.noise import keep
 from fastrod.identification.log.registration import between, frame_of
-from fastrod.identification.log.split import SplitLog, thinned
-from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, known_model, nominal_of
+from fastrod.identification.log.samples import LogSamples
+from fastrod.identification.log.split import SplitLog
+from fastrod.identification.log.unknowns import SEGMENT_UNITS, TENDON_UNITS, Model, nominal_of
+from fastrod.identification.report.explained import NEAR, Explained, error_of, shipped, tips_of
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.signature import signatures
 from fastrod.identification.report.verdict import AT_A_PRICE, VerdictGrounds, choose_verdict, strained
 from fastrod.identification.report.wording import amount, plain_name, words
-from fastrod.identification.search.base import SEEN, BaseFit, Rival, search_on
+from fastrod.identification.search.base import SEEN, BaseFit, Rival
 from fastrod.identification.search.model_selection import (
     BIC_STRONG,
     Z_ACCEPT,
@@ -30,16 +30,14 @@ from fastrod.identification.search.model_selection import (
 )
 from fastrod.identification.search.residual_test import ResidualStructure, faster_than_commands
 from fastrod.identification.search.revisits import Visits
-from fastrod.identification.search.search import MOST_OF, Search, SearchOutcome, lost_with_it
+from fastrod.identification.search.search import SearchOutcome
 from fastrod.identification.search.solve import BEYOND, Estimate, Fit, covariance, rms
 from fastrod.identification.search.structure import NAME as ONE_SIDED
 from fastrod.identification.search.structure import SLACK, OneSidedTendons
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod.types import Flags, Floats
+from fastrod.types import Floats
 
-ALL_AT_ONCE = 20000
-"""Samples a batch when all are predicted."""
 _MATTERS = 0.05  # of the held-out error above the noise: for an effect of less no run is proposed
 _MOST_ADVICE = 5  # runs
 # of the held-out error: in two blocks of OpenCR's log the friction of the body took 4 and 6 % off it
@@ -50,10 +48,7 @@ _PULL = "pull it beyond its prior and hardly say how far"
 _NARROW = "narrow its prior by less than a third"
 _MOST_SPOKEN = 4  # other names of an effect
 _DIFFERS = 1.02  # of the error without outliers: with them it is said, too
-_NEAR = 1.1  # of the noise: a held-out error within it is explained
-_CONFIRMS = 0.25  # of the gain on fitted data, on those held out: an effect of less is the noise's
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
-_FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 # of the error above the noise: where so much is left, shear and inertia are worth a sentence
 _SAY_LIMITS = 0.05
 _SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
@@ -63,87 +58,6 @@ _RETURNS = 2.8  # of the noise: a command that comes back farther off does so by
 _FAST = 0.2  # of the residual's square, above the commands' band
 _LAG = "second_order_lag"
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """The found effects on every sample: fitted again to all training rows, of which the search saw a
-    part."""
-
-    search: Search
-    start: ModelState
-    """Without effects."""
-    state: ModelState
-    """With those that were found."""
-    names: tuple[str, ...]
-    """Names of these effects, largest displacement first."""
-    outlier: Flags
-    used: Flags
-    test: Flags
-    """(n,) each."""
-    before: Floats
-    bare: Floats
-    after: Floats
-    """(n, 3) predicted tip [m]: of the robot as it was given, of the base model, and with effects."""
-    train_error: Error
-    test_error: Error
-
-    def refused(self, noise: float) -> str:
-        """Why what was found is nothing, or an empty string: with it the rod finds no balance at samples, or
-        the base model left no more than the `noise` [m] anywhere and data held out gain little of what the
-        fitted ones do."""
-        known, found = (np.asarray(np.isfinite(tip).all(1)) for tip in (self.bare, self.after))
-        if lost := lost_with_it(known, found):
-            return lost
-        train, test = self.train_error, self.test_error
-        gained, held_out = (1.0 - (error.after / error.before) ** 2 for error in (train, test))
-        at_noise = max(train.before, test.before) <= _NEAR * noise
-        in_vain = bool(self.names) and at_noise and held_out < _CONFIRMS * gained
-        return "data held out do not gain what the fitted ones do" if in_vain else ""
-
-
-def explain(log: SplitLog, base: BaseFit, outcome: SearchOutcome, whole: bool = False) -> Explained:
-    """The base model and what was found beside it, predicted on every sample of a log; in motion fitted to
-    the `whole` of it, or as the search has left it."""
-    search, state, names = outcome.search, outcome.state, outcome.names
-    samples, rows = log.samples, thinned(log.rows, ALL_AT_ONCE)
-    # each row of a rod of modes, or in motion, costs much more, and the search saw enough of them
-    if search.rod.of_modes or search.in_motion:
-        rows = log.rows if whole else search.samples.rows
-    start = outcome.start
-    seen_all = search.in_motion or not (names and _flags_moved(search, state, base))
-    if len(rows) > len(search.samples.rows) or not seen_all:
-        piece = samples.on(rows)
-        search = search_on(piece, base, search.target.sigma, state)
-        state = _nearer(state, search.again(state), piece, base)
-        # with its own weights: what the base model does not explain must not push its parameters
-        again = search_on(piece, base, base.search.target.sigma, state).again(start)
-        start = _nearer(start, again, piece, base)
-    names = _in_order(names, search, start, state, base.noise.sigma)
-    bare = tips_of(start, samples, base)
-    given = base.without
-    before = tips_of(given.start, given.search.samples, given) if given else bare
-    after = tips_of(state, samples, base) if names else bare
-    measured, outlier = samples.log.measured, np.zeros(len(samples.log), bool)
-    residual = np.asarray(samples.log.tip_position) - after
-    seen = np.flatnonzero(measured & np.isfinite(residual).all(1))
-    outlier[seen] = ~keep(samples.on(seen), residual[seen], base.noise)
-    measured = measured & np.isfinite(before).all(1) & np.isfinite(after).all(1)
-    used, test = measured & ~log.tested & ~outlier, measured & log.tested & ~outlier
-    tested = measured & log.tested
-    length = base.noise.model.length
-    errors = (
-        error_of(samples, before, after, which, every, length)
-        for which, every in ((used, measured & ~log.tested), (test, tested))
-    )
-    return Explained(search, start, state, names, outlier, used, test, before, bare, after, *errors)
-
-
-def _flags_moved(search: Search, state: ModelState, base: BaseFit) -> bool:
-    """Whether other rows are outliers of what a state leaves than were of the base model's residual."""
-    pose = _predicted(state, search.samples, base)
-    good = keep(search.samples, np.nan_to_num(search.target.tip - pose.position), base.noise) & pose.ok
-    return bool((good != (search.target.weight > 0.0)).any())
 
 
 def verdict_on(
@@ -170,8 +84,8 @@ def verdict_on(
             *(_spoken(name, explained.state.model, classes) for name in explained.names),
         ],
         held_out=(error.before, error.after),
-        at_floor=held_out <= _NEAR * floor,
-        like_noise=held_out <= max(_NEAR * floor, base.noise.most(n_held_out)),
+        at_floor=held_out <= NEAR * floor,
+        like_noise=held_out <= max(NEAR * floor, base.noise.most(n_held_out)),
         evident=error.after < _FALLS * error.before
         and all(one.z > Z_ACCEPT and one.bic_gain > BIC_STRONG for one in named.values()),
     )
@@ -358,59 +272,10 @@ def _left_out(explained: Explained, error: Error) -> list[str]:
     return said
 
 
-def _predicted(state: ModelState, piece: LogSamples, base: BaseFit) -> PredictedPose:
-    return base.search.predict(state.model, state.theta, piece)
-
-
-def _nearer(one: ModelState, other: ModelState, piece: LogSamples, base: BaseFit) -> ModelState:
-    """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where
-    a load makes the rod snap."""
-
-    def off(state: ModelState) -> float:
-        pose, far = _predicted(state, piece, base), _FAR * base.robot.length
-        error = np.linalg.norm(np.asarray(piece.log.tip_position)[piece.rows] - pose.position, axis=1)
-        return float(np.mean(np.where(pose.ok, np.minimum(error, far), far) ** 2))
-
-    return other if off(other) <= off(one) else one
-
-
 def _square(state: ModelState) -> float:
     """Mean square distance that a state leaves at the samples of the search [m^2]."""
     counted = state.fit.residual[np.any(state.fit.residual != 0.0, axis=1), :3]
     return float(np.mean(((counted * state.linearised.target.sigma) ** 2).sum(1))) if len(counted) else 0.0
-
-
-def _in_order(
-    names: tuple[str, ...], search: Search, start: ModelState, state: ModelState, noise: Floats
-) -> tuple[str, ...]:
-    """First the effect of `state` that moves the prediction most. Those that correct each other move it far,
-    too: they come after all that alone take half of what the best takes from `start`."""
-    if len(names) < 2:
-        return names
-    search, bare = search.weighed(start, noise)
-    takes = {name: bare.fit.loss - search.beside(bare, name, state).fit.loss for name in names}
-    least = MOST_OF * max(takes.values())
-    return tuple(sorted(names, key=lambda name: (takes[name] < least, -_own(state, name))))
-
-
-def _own(state: ModelState, name: str) -> float:
-    """Return how far an effect by itself moves the prediction: squares over the samples, the other
-    parameters as they are."""
-    theta = state.theta.copy()
-    for j, unknown in enumerate(state.model.unknowns):
-        if unknown.place[:2] == ("effect", name) and not unknown.shape:
-            theta[j] = unknown.mean
-    with_it, without = (state.linearised.residual(state.model, at) for at in (state.theta, theta))
-    return float(((with_it - without) ** 2).sum())
-
-
-def shipped(base: BaseFit, used: Flags, test: Flags) -> tuple[float, float]:
-    """Error of the robot file as it is, nothing fitted, on fitted and on held-out samples [m]."""
-    given = base.without or base
-    samples = given.search.samples
-    tip = _tips(known_model(given.robot), np.zeros(0), samples, given)
-    fitted, held_out = (error_of(samples, tip, tip, rows).before for rows in (used, test))
-    return fitted, held_out
 
 
 def _other_tendons(
@@ -577,71 +442,13 @@ def estimates_of(model: Model, fit: Fit) -> tuple[dict[str, Estimate], tuple[lis
     return made, ([u.name for u in model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
 
-def tips_of(state: ModelState, samples: LogSamples, base: BaseFit) -> Floats:
-    """(n, 3) predicted tip of every driven sample [m]; nan where the rod did not converge."""
-    return _tips(state.model, state.theta, samples, base)
-
-
-def _tips(model: Model, theta: Floats, samples: LogSamples, base: BaseFit) -> Floats:
-    """The same of a model at `theta` (p,)."""
-    tip = np.full((len(samples.log), 3), np.nan)
-    # in motion rows need those before them
-    pieces = 1 if base.search.in_motion else -(-len(tip) // ALL_AT_ONCE)
-    for rows in np.array_split(np.arange(len(tip)), pieces):
-        pose = base.search.predict(model, theta, samples.on(rows))
-        tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
-    return tip
-
-
-def _distance(samples: LogSamples, predicted: Floats, which: Flags) -> Floats:
-    squares = ((np.asarray(samples.log.tip_position) - predicted)[which] ** 2).sum(1)
-    return np.asarray(squares[np.isfinite(squares)])
-
-
-def error_of(
-    samples: LogSamples,
-    before: Floats,
-    after: Floats,
-    which: Flags,
-    every: Flags | None = None,
-    length: float = 1.0,
-) -> Error:
-    """Distance rms [m] at the samples of a mask, of tips (n, 3) predicted before and after; the mask `every`
-    has those that were left out as outliers, too. One of `length` samples is independent."""
-    if not which.any():
-        return Error(before=float("nan"), after=float("nan"), interval=(float("nan"), float("nan")))
-    values = [float(np.sqrt(_distance(samples, p, which).mean())) for p in (before, after)]
-    interval = interval_of(samples, after, which, length)
-    whole = values[1] if every is None else float(np.sqrt(_distance(samples, after, every).mean()))
-    return Error(before=values[0], after=values[1], interval=interval, all_rows=whole)
-
-
-def interval_of(
-    samples: LogSamples, predicted: Floats, which: Flags, length: float = 1.0
-) -> tuple[float, float]:
-    """95 % interval of a distance rms, by resampling blocks of samples that are longer than the `length` of
-    which one is independent."""
-    squares = _distance(samples, predicted, which)
-    if len(squares) < 20:
-        return float("nan"), float("nan")
-    blocks = max(4, min(20, len(squares) // 5, int(len(squares) / (2.0 * length))))
-    means_of_blocks = [b.mean() for b in np.array_split(squares, blocks)]
-    rng = np.random.default_rng(0)
-    means = rng.choice(means_of_blocks, (2000, len(means_of_blocks))).mean(1)
-    low, high = np.sqrt(np.quantile(means, [0.025, 0.975]))
-    return float(low), float(high)
-
-
 def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStage]:
     """Error after each effect, added in the order of what each brings."""
 
     def stage(name: str, at: ModelState) -> SearchStage:
         tip = tips_of(at, log.samples, base)
-        errors = [
-            float(np.sqrt(_distance(log.samples, tip, which).mean())) if which.any() else float("nan")
-            for which in (explained.used, explained.test)
-        ]
-        return SearchStage(name=name, train=errors[0], held_out=errors[1])
+        train, test = (error_of(log.samples, tip, tip, own) for own in (explained.used, explained.test))
+        return SearchStage(name=name, train=train.before, held_out=test.before)
 
     stages, noise = [stage("base", explained.start)], base.noise.sigma
     if base.without:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fastrod.identification.log.split import SplitLog
-from fastrod.identification.report.assemble import error_of, shipped, tips_of
+from fastrod.identification.report.explained import error_of, shipped, tips_of
 from fastrod.identification.report.result import Found, Result, SearchStage
 from fastrod.identification.report.wording import BASE_MODELS, words
 from fastrod.identification.search.base import BaseFit

@@ -11,23 +11,9 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from fastrod.effects.base import get_effect, trait
-from fastrod.identification.report import figures
+from fastrod.identification.report import figures, wording
 from fastrod.identification.report.result import Found, Result
 from fastrod.identification.report.signals import Signals
-from fastrod.identification.report.wording import (
-    NOTHING,
-    VERDICTS,
-    bound_sentence,
-    estimate,
-    friendly,
-    law,
-    millimetres,
-    percent,
-    plain_name,
-    rounded,
-    with_error,
-    words,
-)
 from fastrod.model.robotfile import robot_names
 
 _FRACTIONS = {
@@ -50,7 +36,7 @@ def page(result: Result) -> str:
     kind = {"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind)
     every = {
         "of the robot": result.base_parameters,
-        **{f"of {words(found.name)}": found.parameters for found in result.effects},
+        **{f"of {wording.words(found.name)}": found.parameters for found in result.effects},
     }
     indistinct = [found for found in result.effects if found.cannot_be_told_from]
     text: str = _template().render(
@@ -79,13 +65,11 @@ def _template() -> Any:
     environment = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
     )
-    by_name = (bound_sentence, estimate, friendly, law, percent, plain_name, rounded, with_error, words)
-    environment.globals.update({function.__name__: function for function in by_name})
-    environment.globals.update(
-        mm=millimetres, finite=math.isfinite, signed=_signed, scores=_scores, figures=figures
-    )
-    environment.globals.update(verdicts=VERDICTS, nothing=NOTHING)
-    environment.filters.update(bound_sentence=bound_sentence, plain_name=plain_name, words=words)
+    by_name = {name: each for name, each in vars(wording).items() if callable(each)}
+    environment.globals.update(by_name, mm=wording.millimetres, finite=math.isfinite, signed=_signed)
+    environment.globals.update(scores=_scores, figures=figures)
+    environment.globals.update(verdicts=wording.VERDICTS, nothing=wording.NOTHING)
+    environment.filters.update({name: by_name[name] for name in ("bound_sentence", "plain_name", "words")})
     text = (files("fastrod.identification") / "page.html").read_text(encoding="utf-8")
     return environment.from_string(text)
 
@@ -94,7 +78,7 @@ def _would_show(result: Result) -> list[str]:
     """Sentences on the effects that robots often have, and that this one would have shown."""
     seen = [bound for bound in result.bounds if math.isfinite(bound.value)]
     often = sorted(seen, key=lambda bound: not trait(get_effect(bound.name), "frequent"))
-    return [bound_sentence(bound) for bound in often[:6]]
+    return [wording.bound_sentence(bound) for bound in often[:6]]
 
 
 def _bars(result: Result) -> list[dict[str, Any]]:
@@ -125,7 +109,9 @@ def _bars(result: Result) -> list[dict[str, Any]]:
             right = max(right, floor / whole)
         figures_of = {"width": width, "floor": floor / whole, "right": right}
         bar = {name: f"{percentage:.2f}" for name, percentage in figures_of.items()}
-        made.append({**bar, "label": label, "kind": kind, "interval": span, "value": millimetres(value)})
+        made.append(
+            {**bar, "label": label, "kind": kind, "interval": span, "value": wording.millimetres(value)}
+        )
     return made
 
 
@@ -152,9 +138,11 @@ def _remains(result: Result) -> str:
     if not result.knows_fractions:
         return "This log is too short to say which share of the error above the noise remains."
     if result.remaining_fraction > 0.0:
-        return f"{percent(result.remaining_fraction)} of the error above the noise remains unexplained."
+        return (
+            f"{wording.percent(result.remaining_fraction)} of the error above the noise remains unexplained."
+        )
     if result.above_noise > 0.0:
-        return f"{percent(result.above_noise)} of the held-out mean square is above the noise."
+        return f"{wording.percent(result.above_noise)} of the held-out mean square is above the noise."
     return "Nothing that held-out blocks confirm: what is left looks like noise."
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.effects.base import Signal, get_effect, signal_of
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict
+from fastrod.identification.log.samples import LogSamples, sample
 from fastrod.identification.search.model_selection import ModelState
 from fastrod.logs.runlog import RunLog
 from fastrod.types import Floats

@@ -10,9 +10,10 @@ import numpy as np
 
 from fastrod.errors import LogError
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
+from fastrod.identification.log.forward import PredictedRod, predict
 from fastrod.identification.log.noise import ENOUGH, Noise, at_rest, keep, read_everywhere, read_noise
 from fastrod.identification.log.questions import further_than_still
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, target_of
 from fastrod.identification.search.model_selection import ModelState

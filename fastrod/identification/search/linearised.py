@@ -21,13 +21,13 @@ from fastrod.effects.executor import Link, act, approached, feels_tip, tip_feedb
 from fastrod.effects.ports import CHANGEABLE
 from fastrod.errors import RobotError
 from fastrod.identification.log.forward import (
-    LogSamples,
     PredictedPose,
     PredictedRod,
     PreparedLog,
     effects_at,
     prepare_log,
 )
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
 from fastrod.identification.search.solve import Fit, minimise
 from fastrod.rotation import matrix_from_quaternion

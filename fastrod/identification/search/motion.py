@@ -22,9 +22,10 @@ from fastrod.effects.executor import reads_bend, reads_tension
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import LogError, RobotError
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import LogSamples, PredictedPose, Work
+from fastrod.identification.log.forward import PredictedPose, Work
 from fastrod.identification.log.motion import LONGEST_STEP, MotionReplay
 from fastrod.identification.log.noise import Noise, keep, read_noise
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.base import SEEN, BaseFit
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, Target, target_of

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fastrod.identification.log.forward import LogSamples
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.search.correlation import draws, length
 from fastrod.identification.search.revisits import Revisits
 from fastrod.identification.search.solve import paired

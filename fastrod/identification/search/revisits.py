@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.identification.log.forward import LogSamples, effects_at, prepare_log
+from fastrod.identification.log.forward import effects_at, prepare_log
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model
 from fastrod.types import Flags, Floats, Ints
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from fastrod.effects.base import BodyOperator, effect_names, get_effect, has_memory, trait
 from fastrod.errors import RobotError
-from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict
+from fastrod.identification.log.forward import PredictedPose, PredictedRod, predict
+from fastrod.identification.log.samples import LogSamples
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread

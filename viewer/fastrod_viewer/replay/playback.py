@@ -362,7 +362,7 @@ def _read(path: Path, given: Robot | None, found: _Found | None) -> tuple[RunLog
 
 
 def _samples(log: RunLog) -> Any:
-    from fastrod.identification.log.forward import sample  # loads numba
+    from fastrod.identification.log.samples import sample  # loads numba
 
     if not log.measured.any():
         raise LogError(
@@ -419,6 +419,7 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
     the backbone too."""
     from fastrod.identification.log import forward
     from fastrod.identification.log.inputs import base_of, inputs
+    from fastrod.identification.log.samples import sample
     from fastrod.identification.log.unknowns import known_model
     from fastrod.simulator import Simulator
 
@@ -430,7 +431,7 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
         position, rotation, arclength = state.position, state.rotation, state.arclength
     else:
         model = known_model(robot)
-        samples = forward.sample(log)
+        samples = sample(log)
         place = forward.prepare_log(samples.on(samples.given[frames]), robot, model.wiring)
         effects = forward.effects_at(model, np.zeros(0))
         sim = Simulator(bare, n_robots=len(frames), points_per_segment=forward.N_STEPS)
