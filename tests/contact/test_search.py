@@ -13,21 +13,15 @@ import fastrod
 from fastrod.contact import ContactScene, box, mesh, plane, sphere
 from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
+from fastrod.kernels.contact import proximity
 from fastrod.kernels.contact.centreline import Curve, point_at
-from fastrod.kernels.contact.proximity import (
-    UNSEEN,
-    ProximityOptions,
-    ProximitySearch,
-    search_obstacles,
-    search_work,
-)
 from fastrod.types import CANDIDATE, SearchWork
 
 
 @njit()
 def _search(curve, options, surfaces, frames, distance, position, work, found):
-    return search_obstacles(
-        ProximitySearch(curve, options, surfaces, frames, distance, position, work, found)
+    return proximity.search_obstacles(
+        proximity.ProximitySearch(curve, options, surfaces, frames, distance, position, work, found)
     )
 
 
@@ -38,8 +32,9 @@ def _point(curve, j, fraction):
 
 def _searched(curve, radius, nearest, surfaces, pose, found):
     """How many candidates of one rod and one obstacle there are, and the smallest gap."""
-    options, n = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest), len(curve.arclength)
-    work = SearchWork(*(room[0] for room in search_work(1, n)))
+    n = len(curve.arclength)
+    options = proximity.ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
+    work = SearchWork(*(room[0] for room in proximity.search_work(1, n)))
     frames = frames_of(np.array([[pose]], float))[0]
     return _search(curve, options, surfaces, frames, np.full(n, -np.inf), np.zeros((n, 3)), work, found)
 
@@ -75,9 +70,9 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
         phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
         found = np.zeros(64, CANDIDATE)
         count, gap = _searched(curve, radius, nearest, pack([obstacle]), [0.0, 0, 0, 1, 0, 0, 0], found)
-        assert gap <= phi.min() - radius + UNSEEN
+        assert gap <= phi.min() - radius + proximity.UNSEEN
         dips = 1 + np.flatnonzero(
-            (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
+            (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - proximity.UNSEEN)
         )
         for k in dips if not nearest else []:
             near = np.abs(found["arclength"][:count] - dense[k]) < 1e-3
@@ -111,9 +106,9 @@ def test_every_dip_beside_a_convex_obstacle_is_found(scenes):
         for nearest in (False, True):
             found = np.zeros(64, CANDIDATE)
             count, gap = _searched(curve, radius, nearest, surfaces, pose, found)
-            assert gap <= phi.min() - radius + UNSEEN
+            assert gap <= phi.min() - radius + proximity.UNSEEN
             for d in 1 + np.flatnonzero(
-                (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
+                (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - proximity.UNSEEN)
             ):
                 near = np.abs(found["arclength"][:count] - dense[d]) < 1.1e-3
                 assert nearest or (near.any() and found["gap"][:count][near].min() <= phi[d] - radius + 1e-8)

@@ -30,7 +30,7 @@ from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.base import SEEN, BaseFit
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, Target, target_of
 from fastrod.identification.search.model_selection import Candidate, ModelState, unfitted
-from fastrod.identification.search.search import Search, blocks_of, starts_of
+from fastrod.identification.search.search import Search, blocks_of, grown, starts_of
 from fastrod.identification.search.solve import Estimate, Fit, minimise, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
@@ -310,8 +310,8 @@ class MotionModel:
 
 @dataclass(frozen=True, eq=False)
 class MotionSearch(Search):
-    """The search beside rods in motion. Alternative patterns and bounds are not asked for: both take slopes
-    by the rod's inputs."""
+    """The search beside rods in motion. Alternative patterns are not asked for: they take slopes by the rod's
+    inputs."""
 
     rod: MotionRod  # type: ignore[assignment]
     in_motion: ClassVar[bool] = True
@@ -355,21 +355,14 @@ class MotionSearch(Search):
         """The candidates that promise most, fitted; of the others, that they promise too little."""
         self.report("what each does")
         n, models = len(state.model.unknowns), {name: state.model.with_effect(name) for name in names}
-        every: list[tuple[Robot, ...]] = []
+        trials = list[tuple[Model, Floats]]()
         for name, model in models.items():
-            sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
-            at_zero = np.concatenate([state.theta, model.start[n:]])
-            at_zero[sizes] = [model.unknowns[j].mean for j in sizes]
-            steps = np.diag([u.scale for u in model.unknowns])[sizes]
-            thetas = [at_zero, *np.clip(at_zero + steps, *model.limits)]
+            sizes, thetas = grown(state, model)
             for start in _starts(state, model, name):
                 thetas.append(start)
                 thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
-            every += [model.in_sessions(theta) for theta in thetas]
-        quick = self.rod.at(self.samples, _QUICK * self.rod.longest_step)
-        quick.poses(every)
-        near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
-        state = replace(state, linearised=cast(LinearisedModel, near))
+            trials += [(model, theta) for theta in thetas]
+        state = replace(state, linearised=self._ahead(state, trials))
         promise = {
             name: max(self._promise(state, model, theta) for theta in _starts(state, model, name))
             for name, model in models.items()
@@ -386,6 +379,13 @@ class MotionSearch(Search):
         tried = self._each(state, [partial(self.candidate, state, name) for name in worth])
         fitted, few = dict(zip(worth, tried, strict=True)), "it promises too little"
         return [fitted.get(name) or unfitted(name, few, len(models[name].unknowns) - n) for name in names]
+
+    def _ahead(self, state: ModelState, trials: Sequence[tuple[Model, Floats]]) -> LinearisedModel:
+        """All of them moved in one batch, in longer steps."""
+        quick = self.rod.at(self.samples, _QUICK * self.rod.longest_step)
+        quick.poses([model.in_sessions(theta) for model, theta in trials])
+        near = MotionModel(state.model, state.theta, self.samples, quick, self.target)
+        return cast(LinearisedModel, near)
 
     def _each(self, state: ModelState, jobs: Sequence[Callable[[], _T]]) -> list[_T]:
         return cast(MotionModel, state.linearised).rod.side_by_side.each(jobs)

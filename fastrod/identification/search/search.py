@@ -7,10 +7,11 @@ Every candidate starts from the same reference, weights and outlier mask. Altern
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
+from types import MappingProxyType
 from typing import ClassVar, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from fastrod.effects.base import BodyOperator, effect_names, get_effect, has_mem
 from fastrod.errors import RobotError
 from fastrod.identification.log.forward import PredictedPose, PredictedRod, predict
 from fastrod.identification.log.samples import LogSamples
-from fastrod.identification.log.unknowns import Model
+from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.correlation import blocks_alike, length, residual_correlation, spread
 from fastrod.identification.search.linearised import LinearisedModel, Target
@@ -325,23 +326,12 @@ class Search:
         """Size parameters of the effect that a model has more that move nothing in this log beyond its noise:
         left at neutral. Beside what is left before it is found they may be small, and yet be its
         direction."""
-        n = len(state.model.unknowns)
-        theta = np.concatenate([state.theta, model.start[n:]])
-        at_zero = theta.copy()
-        for j, u in enumerate(model.unknowns[n:], n):
-            if not u.shape:
-                at_zero[j] = u.mean
-        base = state.linearised.residual(model, at_zero)
+        sizes, (neutral, *larger) = grown(state, model)
+        base = state.linearised.residual(model, neutral)
         of_noise = max(1.0, float(np.mean((self.target.sigma / self.noise) ** 2)))
-        unseen = []
-        for j, u in enumerate(model.unknowns[n:], n):
-            if u.shape:
-                continue
-            moved = at_zero.copy()
-            moved[j] = np.clip(u.mean + u.scale, *u.limits)
-            if of_noise * float(((state.linearised.residual(model, moved) - base) ** 2).sum()) < 4.0:
-                unseen.append(u.name.partition(".")[2])
-        return unseen
+        moved = [float(((state.linearised.residual(model, at) - base) ** 2).sum()) for at in larger]
+        unseen = [j for j, by in zip(sizes, moved, strict=True) if of_noise * by < 4.0]
+        return [model.unknowns[j].name.partition(".")[2] for j in unseen]
 
     def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
         linearised, n = state.linearised, len(state.model.unknowns)
@@ -358,6 +348,10 @@ class Search:
         )
         best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
         return near(best, amplitudes, patterns, _MANY, known)
+
+    def _ahead(self, state: ModelState, trials: Sequence[tuple[Model, Floats]]) -> LinearisedModel:  # noqa: ARG002
+        """Return what answers for all these models near a state."""
+        return state.linearised
 
     def _each(self, state: ModelState, jobs: Sequence[Callable[[], _T]]) -> list[_T]:  # noqa: ARG002
         """Return what each of the jobs beside a state does, which do not depend on each other."""
@@ -775,51 +769,44 @@ class Search:
         correlation = residual_correlation(state.fit.residual)
         flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
         base = flat.T @ flat + np.diag(state.fit.precision)
-        made = []
-        for name in () if self.in_motion else self.names(state):
-            model = state.model.with_effect(name)
-            n = len(state.model.unknowns)
-            theta = np.concatenate([state.theta, model.start[n:]])
-            for j, u in enumerate(model.unknowns[n:], n):
-                if not u.shape:
-                    theta[j] = u.mean
-            at = state.linearised.residual(model, theta)
-            worst: dict[str, float] = {}
-            units: dict[str, str] = {}
-            sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
-            for j in sizes:
-                u = model.unknowns[j]
-                moved = theta.copy()
-                step = u.scale if u.mean + u.scale <= u.bounds[1] else -u.scale
-                moved[j] = u.mean + step
-                column = (at - state.linearised.residual(model, moved)).ravel() / step
-                cross = flat.T @ column
-                absorbed = least_squares(base, cross)
-                power = float(column @ column - cross @ absorbed)
-                # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
-                kind = next(
-                    p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name)
-                )
-                key = (
-                    kind
-                    if kind[-2:] not in ("_x", "_y", "_z") and kind not in ("x", "y", "z")
-                    else kind[:-1].rstrip("_")
-                )
-                if power <= 1e-6 * float(column @ column) or power * u.scale**2 < 1e-2:
-                    worst[key] = np.inf
-                    continue
-                estimate = float(column @ state.fit.residual.ravel()) / power
-                own = (column - flat @ absorbed).reshape(*state.fit.residual.shape, 1)
-                stderr = np.sqrt(variance * spread(own, correlation) / power)
-                worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * stderr)
-                units[key] = u.unit
-            made += [
-                DetectionLimit(
-                    name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan")
-                )
-                for key, size in worst.items()
-            ]
+        models = {name: state.model.with_effect(name) for name in self.names(state)}
+        size, made = dict[str, float](), list[DetectionLimit]()
+        # by the response to what is usual, then to the geometric mean of that and of what would just show:
+        # right for a response that goes by the size, and for one that goes by its square
+        for _ in range(2):
+            trials = {name: grown(state, model, size) for name, model in models.items()}
+            near = self._ahead(state, [(models[name], at) for name in models for at in trials[name][1]])
+            made = []
+            for name, (sizes, (neutral, *larger)) in trials.items():
+                worst, at = dict[str, tuple[float, str]](), near.residual(models[name], neutral)
+                for j, theta in zip(sizes, larger, strict=True):
+                    u = models[name].unknowns[j]
+                    column = (at - near.residual(models[name], theta)).ravel() / (theta[j] - neutral[j])
+                    column = np.nan_to_num(column, posinf=0.0, neginf=0.0)  # where the rod was lost
+                    cross = flat.T @ column
+                    absorbed = least_squares(base, cross)
+                    power = float(column @ column - cross @ absorbed)
+                    here = np.inf
+                    if power > 1e-6 * float(column @ column) and power * u.scale**2 >= 1e-2:
+                        estimate = float(column @ state.fit.residual.ravel()) / power
+                        own = (column - flat @ absorbed).reshape(*state.fit.residual.shape, 1)
+                        stderr = np.sqrt(variance * spread(own, correlation) / power)
+                        here = float(abs(estimate) + 3.0 * stderr)
+                        size[u.name] = float(np.sqrt(here * u.scale))
+                    key = _kind_of(name, u)
+                    worst[key] = max(worst.get(key, (0.0, u.unit)), (here, u.unit))
+                made += [
+                    DetectionLimit(name, key or "size", unit, value if np.isfinite(value) else float("nan"))
+                    for key, (value, unit) in worst.items()
+                ]
         return made
+
+
+def _kind_of(name: str, u: Unknown) -> str:
+    """The parameter that a number of an effect is of: x, y, z of one kind, and drives, are one size."""
+    parameters = get_effect(name).parameters
+    kind = next(p.name for p in parameters if u.name.partition(".")[2].startswith(p.name))
+    return kind[:-1].rstrip("_") if kind in ("x", "y", "z") or kind[-2:] in ("_x", "_y", "_z") else kind
 
 
 def _suspicion(name: str, z: float, with_it: float, without: float) -> str:
@@ -853,6 +840,24 @@ def _yields(robot: Robot) -> bool:
         > _STIFF * float(np.mean(t.offset)) ** 2 * robot.segments[k].length
         for t, k in ends
     )
+
+
+def grown(
+    state: ModelState, model: Model, size: Mapping[str, float] = MappingProxyType({})
+) -> tuple[list[int], list[Floats]]:
+    """Which numbers of `model` are sizes of the effect that it has and `state` has not; all its numbers (p,)
+    where that does nothing, then with one size at a time as large as is usual, or as `size` says if that is
+    less."""
+    n = len(state.model.unknowns)
+    sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+    made = [np.concatenate([state.theta, model.start[n:]])]
+    made[0][sizes] = [model.unknowns[j].mean for j in sizes]
+    for j in sizes:
+        u = model.unknowns[j]
+        step = min(size.get(u.name, u.scale), u.scale)
+        made.append(made[0].copy())
+        made[-1][j] += step if u.mean + step <= u.bounds[1] else -step
+    return sizes, made
 
 
 def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
