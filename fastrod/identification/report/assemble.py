@@ -452,9 +452,8 @@ def _path(explained: Explained, log: SplitLog, base: BaseFit) -> list[SearchStag
 
     stages, noise = [stage("base", explained.start)], base.noise.sigma
     if base.without:
-        errors = explained.train_error.before, explained.test_error.before
-        given = SearchStage(name="base", train=errors[0], held_out=errors[1])
-        stages = [given, replace(stages[0], name=ONE_SIDED)]
+        train, test = explained.train_error.before, explained.test_error.before
+        stages = [SearchStage(name="base", train=train, held_out=test), replace(stages[0], name=ONE_SIDED)]
     # as the search finds them: taken away from the whole model one by one, effects that correct each other
     # leave a fit that starts far from where it should end
     search, piece = explained.search.weighed(explained.start, noise)

@@ -1,4 +1,4 @@
-"""What was found, on every sample of a log: its fit to all of them, predicted tips, and errors."""
+"""The effects that were found, on every sample of a log: fitted to all of them, predicted tips, errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ALL_AT_ONCE = 20000
 _CONFIRMS = 0.25  # of the gain on fitted data, on those held out: an effect of less is the noise's
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 NEAR = 1.1
-"""Of the noise: a held-out error within it is explained."""
+"""A held-out error within so many times the noise is explained."""
 
 
 @dataclass(frozen=True, eq=False)

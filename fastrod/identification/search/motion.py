@@ -8,7 +8,7 @@ known of what they stand beside.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -30,7 +30,7 @@ from fastrod.identification.log.unknowns import Model, Unknown
 from fastrod.identification.search.base import SEEN, BaseFit
 from fastrod.identification.search.linearised import ANGLE, LinearisedModel, Target, target_of
 from fastrod.identification.search.model_selection import Candidate, ModelState, unfitted
-from fastrod.identification.search.search import Search, blocks_of, grown, starts_of
+from fastrod.identification.search.search import Search, blocks_of, distinct, grown, starts_of
 from fastrod.identification.search.solve import Estimate, Fit, minimise, rms
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats
@@ -51,6 +51,7 @@ _GEOMETRY = ("length", "offset", "angle")
 _MOST = 160  # robots of a batch
 _KEPT = 20_000_000  # numbers of the orientations that are remembered, 160 MB: of 1,000 robots at 2,200 rows
 _FITTED = 4  # candidates of a stage that are fitted
+_NEAR = 3.0  # times what a state leaves: other numbers that promise to leave more are no way out
 _PROMISING = 0.3  # of what the best promises: others are not fitted
 _ITERATIONS, _TRIES, _REFINED = 6, 6, 3
 _SHORTER = (0.15, 0.3, 0.5, 0.7)  # of the times at which a fit begins at rest
@@ -315,6 +316,7 @@ class MotionSearch(Search):
 
     rod: MotionRod  # type: ignore[assignment]
     in_motion: ClassVar[bool] = True
+    drawn: ClassVar[float] = 2.0  # here a fit goes all the way, and few candidates are fitted
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
         """Return what the camera sees at the rows of `samples`."""
@@ -352,33 +354,47 @@ class MotionSearch(Search):
         return [name for name in super().names(state) if not trait(get_effect(name), "feels_tip")]
 
     def _tried(self, state: ModelState, names: Sequence[str]) -> list[Candidate]:
-        """The candidates that promise most, fitted; of the others, that they promise too little."""
+        """The candidates that promise most, fitted; of the others, that they promise too little. Where a fit
+        has drawn a number of the robot far from its file, those that promise most from there, too."""
+        models = {name: state.model.with_effect(name) for name in names}
+        here, worth = self._promising(state, models)
+        jobs = [(name, partial(self.candidate, here, name)) for name in worth]
+        if (nominal := self._nominal(here)) is not None:
+            given = self._state(state.model, nominal, nominal.fit(state.model, nominal.theta, 0), ())
+            there, worth = self._promising(given, models, _NEAR * state.fit.loss)
+            jobs += [(name, partial(self._anew, here, there.linearised, name)) for name in worth]
+        found = dict[str, Candidate]()
+        for (name, _), one in zip(jobs, self._each(here, [job for _, job in jobs]), strict=True):
+            if name not in found or (one.passes and distinct(one, found[name])):
+                found[name] = one
+        n, few = len(state.model.unknowns), "it promises too little"
+        return [found.get(name) or unfitted(name, few, len(models[name].unknowns) - n) for name in names]
+
+    def _promising(
+        self, state: ModelState, models: Mapping[str, Model], most: float | None = None
+    ) -> tuple[ModelState, list[str]]:
+        """The state with rods that have been at every start of these models, and those that promise most.
+        Where `most` is given the state is at no minimum, and they must promise to leave no more loss."""
         self.report("what each does")
-        n, models = len(state.model.unknowns), {name: state.model.with_effect(name) for name in names}
+        starts = {name: _starts(state, model, name) for name, model in models.items()}
         trials = list[tuple[Model, Floats]]()
         for name, model in models.items():
             sizes, thetas = grown(state, model)
-            for start in _starts(state, model, name):
-                thetas.append(start)
-                thetas += [np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes]
+            for start in starts[name]:
+                without = (np.where(np.arange(len(start)) == j, model.unknowns[j].mean, start) for j in sizes)
+                thetas += [start, *without]
             trials += [(model, theta) for theta in thetas]
         state = replace(state, linearised=self._ahead(state, trials))
+        loss, size, n = state.fit.loss, state.fit.residual.size, len(state.model.unknowns)
         promise = {
-            name: max(self._promise(state, model, theta) for theta in _starts(state, model, name))
-            for name, model in models.items()
+            name: max(self._promise(state, models[name], start, most is None) for start in every)
+            for name, every in starts.items()
         }
         first = sorted(promise, key=lambda name: -promise[name])[:_FITTED]
         # of the loss: what the evidence asks of each number that a candidate adds
-        size = state.fit.residual.size
-        price = {name: (len(models[name].unknowns) - n) * np.log(size) / size for name in first}
-        worth = [
-            name
-            for name in first
-            if promise[name] > max(_PROMISING * promise[first[0]], price[name] * state.fit.loss)
-        ]
-        tried = self._each(state, [partial(self.candidate, state, name) for name in worth])
-        fitted, few = dict(zip(worth, tried, strict=True)), "it promises too little"
-        return [fitted.get(name) or unfitted(name, few, len(models[name].unknowns) - n) for name in names]
+        price = {name: (len(models[name].unknowns) - n) * np.log(size) / size * loss for name in first}
+        least = max(_PROMISING * max(promise.values(), default=0.0), loss - (most or np.inf))
+        return state, [name for name in first if promise[name] > max(least, price[name])]
 
     def _ahead(self, state: ModelState, trials: Sequence[tuple[Model, Floats]]) -> LinearisedModel:
         """All of them moved in one batch, in longer steps."""
@@ -390,9 +406,9 @@ class MotionSearch(Search):
     def _each(self, state: ModelState, jobs: Sequence[Callable[[], _T]]) -> list[_T]:
         return cast(MotionModel, state.linearised).rod.side_by_side.each(jobs)
 
-    def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
+    def _promise(self, state: ModelState, model: Model, theta: Floats, settled: bool = True) -> float:
         with np.errstate(invalid="ignore"):
-            found = super()._promise(state, model, theta)
+            found = super()._promise(state, model, theta, settled)
         return found if np.isfinite(found) else 0.0
 
 

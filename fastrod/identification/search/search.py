@@ -113,6 +113,8 @@ class Search:
     """(k,) autocorrelation of the noise from row to row, until it has faded; (1,) of white noise."""
     report: Callable[[str], None] = field(default=lambda _: None)
     in_motion: ClassVar[bool] = False
+    drawn: ClassVar[float] = BEYOND
+    """sd from its prior, from which on a number of the robot may stand in for an effect."""
 
     def predict(self, model: Model, theta: Floats, samples: LogSamples) -> PredictedPose:
         """Return what the camera sees at the rows of `samples`, solved exactly."""
@@ -292,7 +294,7 @@ class Search:
             variants += [] if drive is None else [(law, drive)]
         for law, drive in variants:
             other = self._candidate(state, law, drive)
-            best = other if other.passes and _distinct(other, best) else best
+            best = other if other.passes and distinct(other, best) else best
         return best
 
     def _drive(self, state: ModelState, name: str) -> int | None:
@@ -357,9 +359,9 @@ class Search:
         """Return what each of the jobs beside a state does, which do not depend on each other."""
         return [job() for job in jobs]
 
-    def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
+    def _promise(self, state: ModelState, model: Model, theta: Floats, settled: bool = True) -> float:
         """Loss that the response to the new parameters could take away at best, beside what the others can
-        absorb."""
+        absorb, which are at their minimum if `settled`."""
         n = len(state.model.unknowns)
         patterns = state.columns @ state.fit.theta[n:] if state.alternatives else 0.0
         at = state.linearised.residual(model, theta) - patterns
@@ -381,8 +383,8 @@ class Search:
             np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)])
         )
         b = J.T @ r
-        # the base is at its minimum, priors and all
-        b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)
+        if settled:  # priors and all
+            b[: base.shape[1]] = 0.0
         return float(b @ least_squares(gram, b))
 
     def judged(
@@ -575,17 +577,17 @@ class Search:
             one = self.candidate(state, name)
             if nominal is not None and not self.spent:
                 other = self._anew(state, nominal, name)
-                one = other if other.passes and _distinct(other, one) else one
+                one = other if other.passes and distinct(other, one) else one
             tried.append(one)
         return tried
 
     def _nominal(self, state: ModelState) -> LinearisedModel | None:
         """The model at the robot that its file says, where a fit has drawn a number far from there: that may
-        stand in for the effect that is missing, and no slope leads back. A rod of modes or in motion has no
-        time for it."""
+        stand in for the effect that is missing, and no slope leads back. Rods of modes have no time for
+        it."""
         mean, sd = state.model.prior
         own = np.array([u.place[0] != "effect" for u in state.model.unknowns], bool)
-        if self.in_motion or self.rod.of_modes or not (np.abs(state.theta - mean) > BEYOND * sd)[own].any():
+        if self.rod.of_modes or not (np.abs(state.theta - mean) > self.drawn * sd)[own].any():
             return None
         return self._near(state.model, np.where(own, mean, state.theta))
 
@@ -895,7 +897,7 @@ def starts_of(state: ModelState, model: Model, name: str) -> list[Floats]:
     return made
 
 
-def _distinct(one: Candidate, other: Candidate) -> bool:
+def distinct(one: Candidate, other: Candidate) -> bool:
     """Whether blocks and evidence say that an effect is one drive's and not every drive's, or of this law, or
     at these numbers."""
     return other.state is None or _clearly_better(one, other)
