@@ -14,6 +14,7 @@ from fastrod.effects.base import get_effect, trait
 from fastrod.identification.report import figures, wording
 from fastrod.identification.report.result import Found, Result
 from fastrod.identification.report.signals import Signals
+from fastrod.identification.search.model_selection import DetectionLimit
 from fastrod.model.robotfile import robot_names
 
 _FRACTIONS = {
@@ -39,6 +40,8 @@ def page(result: Result) -> str:
         **{f"of {wording.words(found.name)}": found.parameters for found in result.effects},
     }
     indistinct = [found for found in result.effects if found.cannot_be_told_from]
+    seen = [bound for bound in result.bounds if math.isfinite(bound.value)]
+    shown = {bound.name for bound in seen}
     text: str = _template().render(
         r=result,
         style=(files("fastrod.identification") / "page.css").read_text(encoding="utf-8"),
@@ -46,11 +49,11 @@ def page(result: Result) -> str:
         tested=int((result.tested & result.measured).sum()),
         ratio=result.test.after / floor if floor > 0.0 else math.nan,
         bars=_bars(result),
-        would_show=_would_show(result),
+        would_show=_would_show(seen),
         left_is=_FRACTIONS.get(kind, ("of no known kind", ""))[0],
         confusable=indistinct or not all(e.identifiable for e in result.base_parameters.values()),
-        seen=[bound for bound in result.bounds if math.isfinite(bound.value)],
-        unseen=[bound for bound in result.bounds if not math.isfinite(bound.value)],
+        seen=seen,
+        unseen=[*{bound.name: bound for bound in result.bounds if bound.name not in shown}.values()],
         shipped_robots=robot_names(),
         signals=signals,
         views={found.name: signals.view(found) for found in result.effects} if len(signals.rows) else {},
@@ -65,18 +68,15 @@ def _template() -> Any:
     environment = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
     )
-    by_name = {name: each for name, each in vars(wording).items() if callable(each)}
-    environment.globals.update(by_name, mm=wording.millimetres, finite=math.isfinite, signed=_signed)
-    environment.globals.update(scores=_scores, figures=figures)
-    environment.globals.update(verdicts=wording.VERDICTS, nothing=wording.NOTHING)
-    environment.filters.update({name: by_name[name] for name in ("bound_sentence", "plain_name", "words")})
+    said = {name: each for name, each in vars(wording).items() if not name.startswith("_")}
+    environment.globals.update(said, finite=math.isfinite, signed=_signed, scores=_scores, figures=figures)
+    environment.filters.update({name: said[name] for name in ("bound_sentence", "plain_name", "words")})
     text = (files("fastrod.identification") / "page.html").read_text(encoding="utf-8")
     return environment.from_string(text)
 
 
-def _would_show(result: Result) -> list[str]:
+def _would_show(seen: Sequence[DetectionLimit]) -> list[str]:
     """Sentences on the effects that robots often have, and that this one would have shown."""
-    seen = [bound for bound in result.bounds if math.isfinite(bound.value)]
     often = sorted(seen, key=lambda bound: not trait(get_effect(bound.name), "frequent"))
     return [wording.bound_sentence(bound) for bound in often[:6]]
 
