@@ -127,13 +127,10 @@ def assemble(
         effects = [_other_tendons(base, base.without, estimates, path, noise.floor), *effects]
         estimates = {name: e for name, e in estimates.items() if name not in effects[0].parameters}
     wiring = final.model.wiring
-    lacks = (
-        advice.missing_excitation(
-            explained.search.samples, wiring.of_sections(wiring.bend(samples.log.pulls))
-        )
-        if wiring.n_tendons
-        else []
-    )
+    lacks = list[str]()
+    if wiring.n_tendons:
+        bends = wiring.of_sections(wiring.bend(samples.log.pulls))
+        lacks += advice.missing_excitation(explained.search.samples, bends)
     revisits = [again.compare(tip) for tip in (before, after)]
     if wiring.n_tendons and revisits[1] is None:
         lacks.append(
@@ -153,6 +150,8 @@ def assemble(
     say_limits = at_rest and (grounds.left > _SAY_LIMITS or not robot.n_tendons)
     strain = strained(base_estimates)
     other_sessions = dict(enumerate(final.model.sessions[1:], 1))
+    # in motion all of a long log would take as long again
+    looked = explained if at_rest else outcome
     said = [AT_A_PRICE if strain and grounds.verdict == "none" else grounds.summary]
     said += _sign_of(base.without) if base.without else []
     said += _stand_ins(kept, final)
@@ -193,7 +192,7 @@ def assemble(
         patterns=grounds.patterns,
         tried=_tried(steps[0], kept, base) if steps else [],
         path=path,
-        bounds=explained.search.bounds(final),
+        bounds=looked.search.bounds(looked.state if kept else looked.start),
         advice=advice.unique([*recommended, *lacks])[:_MOST_ADVICE],
         sessions={label: final.model.identified(final.theta, k) for k, label in other_sessions.items()},
         notes=[
