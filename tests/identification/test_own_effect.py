@@ -106,8 +106,7 @@ def test_a_report_draws_it_against_its_signal(package: None) -> None:
 
 def test_its_bound_is_among_the_first(package: None) -> None:
     bounds = [DetectionLimit(name, "rate", "1/s", 0.1) for name in (*effect_names()[:8], "worn_cable")]
-    result: Any = SimpleNamespace(effects=[], patterns=[], verdict="none", bounds=bounds)
-    assert any("worn cable" in sentence for sentence in _would_show(result))
+    assert any("worn cable" in sentence for sentence in _would_show(bounds))
 
 
 def test_every_law_of_the_library_has_what_it_had() -> None:
