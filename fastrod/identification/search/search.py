@@ -351,7 +351,7 @@ class Search:
         best, amplitudes = np.split(min(fits, key=lambda fit: fit.loss).theta, [len(model.unknowns)])
         return near(best, amplitudes, patterns, _MANY, known)
 
-    def _ahead(self, state: ModelState, trials: Sequence[tuple[Model, Floats]]) -> LinearisedModel:  # noqa: ARG002
+    def _ahead(self, state: ModelState, _: Sequence[tuple[Model, Floats]]) -> LinearisedModel:
         """Return what answers for all these models near a state."""
         return state.linearised
 
@@ -383,7 +383,7 @@ class Search:
             np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)])
         )
         b = J.T @ r
-        if settled:  # priors and all
+        if settled:  # no slope is left, priors and all
             b[: base.shape[1]] = 0.0
         return float(b @ least_squares(gram, b))
 
